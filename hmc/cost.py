@@ -1,0 +1,54 @@
+"""Costs as named terms, so that a total can always be taken apart again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+StageFn = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+TerminalFn = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Cost:
+    r"""J = sum_k l(x_k, u_k, k) dt + c_f(x_T, T), with l the sum of named terms.
+
+    Attributes:
+        stage: name -> f(x, u, u_prev, k) -> (n,), each already weighted; x (n, nx) is the state at the
+            start of the step, u (n, nu) the input applied during it, u_prev (n, nu) the one before,
+            k (n,) the control step since the start of the task (targets may depend on it).
+        terminal: name -> f(x, k) -> (n,).
+        nonnegative: whether every term is >= 0 everywhere, which lets the planner stop a rollout as
+            soon as its partial cost exceeds the best one known.
+    """
+
+    stage: Mapping[str, StageFn]
+    terminal: Mapping[str, TerminalFn] = field(default_factory=dict)
+    nonnegative: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.stage and not self.terminal:
+            raise ValueError("a cost needs at least one term, got none: pass stage= or terminal=")
+        for name in self.stage:
+            if name in self.terminal:
+                raise ValueError(f"a stage and a terminal term are both called {name!r}: names must differ")
+
+    def stage_terms(self, x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
+        """Stage terms in order of `stage`, (n, number of stage terms)."""
+        if not self.stage:
+            return x.new_zeros(len(x), 0)
+        return torch.stack([f(x, u, u_prev, k) for f in self.stage.values()], dim=-1)
+
+    def terminal_terms(self, x: Tensor, k: Tensor) -> Tensor:
+        """Terminal terms in order of `terminal`, (n, number of terminal terms)."""
+        if not self.terminal:
+            return x.new_zeros(len(x), 0)
+        return torch.stack([f(x, k) for f in self.terminal.values()], dim=-1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all terms, stage terms first."""
+        return (*self.stage, *self.terminal)

@@ -1,0 +1,114 @@
+"""What schedules cost: rollouts in chunks of worlds, no schedule more than once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hmc.rollout import Rolled, Worlds, roll
+from hmc.schedule import Schedule
+from hmc.sim.base import Sim
+from hmc.start import Start
+from hmc.task import Task
+from hmc.trace import Trace, record
+
+
+class _Known(NamedTuple):
+    """Cost and terms of a schedule; where it was pruned, a lower bound of the cost and no terms."""
+
+    cost: float
+    terms: list[float] | None
+
+    def answers(self, bound: float) -> bool:
+        """Whether this is all that a caller with this bound asks for."""
+        return self.terms is not None or self.cost > bound
+
+
+class Evaluator:
+    """Costs of schedules from one start.
+
+    A schedule's cost does not depend on which others are evaluated with it, in which order, or in how
+    large a simulator. A world whose state, input or cost stops being finite costs inf, is counted, and is
+    not stepped any more. Results are kept: an equal schedule is never rolled out twice.
+
+    Attributes:
+        rollouts: schedules rolled out so far.
+        diverged: schedules among them whose world stopped being finite.
+        pruned: schedules among them given up because their partial cost exceeded the bound.
+    """
+
+    def __init__(self, task: Task, sim: Sim, start: Start):
+        self.task, self.sim, self.start = task, sim, start
+        self.rollouts = self.diverged = self.pruned = 0
+        self._worlds = Worlds(task, sim)
+        self._known: dict[bytes, _Known] = {}
+
+    @property
+    def control_steps(self) -> int:
+        """Control steps made so far, over all worlds."""
+        return self._worlds.control_steps
+
+    @torch.no_grad()
+    def costs(
+        self, schedules: Tensor, bound: float = math.inf, stop: Callable[[], bool] | None = None
+    ) -> Tensor:
+        """Costs of schedules (N, T) long -> (N,) float64.
+
+        Args:
+            schedules: mode indices.
+            bound: a schedule that costs more may come back as inf, because its rollout was given up on
+                the way; what costs at most `bound` is exact. Used where cost terms are non-negative.
+            stop: asked before every control step; once it says True, what is not known yet comes back
+                as NaN.
+        """
+        keys = _keys(schedules)
+        todo: dict[bytes, int] = {}
+        for row, key in enumerate(keys):
+            known = self._known.get(key)
+            if known is None or not known.answers(bound):
+                todo.setdefault(key, row)
+        fresh, rows = list(todo), torch.tensor(list(todo.values()), dtype=torch.long)
+        for first in range(0, len(fresh), self.sim.num_worlds):
+            chunk = slice(first, first + self.sim.num_worlds)
+            rolled = roll(self._worlds, self.start, schedules[rows[chunk]], bound, stop)
+            if rolled is None:
+                break
+            self._learn(fresh[chunk], rolled)
+        return torch.tensor([self._answer(key, bound) for key in keys], dtype=torch.float64)
+
+    def cost(self, schedule: Schedule) -> float:
+        """Cost of one schedule."""
+        return float(self.costs(schedule.tensor()[None])[0])
+
+    def terms(self, schedule: Schedule) -> dict[str, float]:
+        """Cost of one schedule, term by term; NaN where its world diverged."""
+        rows = schedule.tensor()[None]
+        self.costs(rows)
+        return dict(zip(self.task.cost.names, self._known[_keys(rows)[0]].terms or (), strict=True))
+
+    def trace(self, schedule: Schedule) -> Trace:
+        """The trajectory of one schedule; its control steps are not counted."""
+        return record(self.task, self.sim, self.start, schedule)
+
+    def _learn(self, keys: list[bytes], rolled: Rolled) -> None:
+        self.rollouts += len(keys)
+        self.diverged += int(rolled.diverged.sum())
+        self.pruned += int(rolled.pruned.sum())
+        rolled.terms[rolled.diverged] = math.nan
+        rows = zip(rolled.cost.tolist(), rolled.terms.tolist(), rolled.pruned.tolist(), strict=True)
+        for key, (cost, terms, pruned) in zip(keys, rows, strict=True):
+            self._known[key] = _Known(cost, None if pruned else terms)
+
+    def _answer(self, key: bytes, bound: float) -> float:
+        known = self._known.get(key)
+        if known is None or not known.answers(bound):
+            return math.nan
+        return math.inf if known.terms is None else known.cost
+
+
+def _keys(schedules: Tensor) -> list[bytes]:
+    return [row.tobytes() for row in schedules.to("cpu", torch.int32).numpy()]

@@ -1,0 +1,75 @@
+"""Modes: anything that can be called to control the robot for a while."""
+
+from __future__ import annotations
+
+import difflib
+import operator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+
+class Mode(ABC):
+    """A controller, batched over worlds.
+
+    A mode is a deterministic function of (x, u, memory, k): called again with the same arguments, in
+    a batch of any size and order, it returns the same action. Random modes draw their noise from a
+    counter keyed by a seed and k. Proposition 1 of the paper rests on that.
+
+    What a mode remembers between steps is one row of ``memory_size`` numbers a world. It belongs to
+    the rolled-out state: it is saved, restored and branched with it, and made anew by `reset` exactly
+    where a schedule enters the mode.
+    """
+
+    name: str
+    memory_size: int = 0
+
+    def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
+        """Memory at entry, (n, memory_size).
+
+        Args:
+            x: state on entry, (n, nx).
+            u: input applied last, by whichever mode ran before, (n, nu).
+            k: control step since the start of the task, (n,) long.
+        """
+        return torch.zeros(len(x), self.memory_size, dtype=x.dtype, device=x.device)
+
+    @abstractmethod
+    def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        """Action for this control step, (n, nu), and the memory after it, (n, memory_size)."""
+
+
+class ModeSet(Sequence[Mode]):
+    """An ordered set of modes; a schedule refers to them by index."""
+
+    def __init__(self, modes: Sequence[Mode]):
+        if not modes:
+            raise ValueError("a mode set needs at least one mode, got none: pass ModeSet([mode, ...])")
+        names = [mode.name for mode in modes]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two modes are called {name!r}: names in a mode set must differ")
+        self._modes = tuple(modes)
+        self.names = tuple(names)
+        self.memory_size = max(mode.memory_size for mode in modes)
+
+    def __len__(self) -> int:
+        return len(self._modes)
+
+    def __iter__(self) -> Iterator[Mode]:
+        return iter(self._modes)
+
+    def __getitem__(self, key):  # type: ignore[no-untyped-def]
+        return self._modes[self.index(key)] if isinstance(key, str) else self._modes[key]
+
+    def index(self, name: str | int) -> int:  # type: ignore[override]
+        """Index of the mode called `name`; an index is checked and comes back as it is."""
+        if isinstance(name, str) and name in self.names:
+            return self.names.index(name)
+        if not isinstance(name, str) and 0 <= operator.index(name) < len(self):
+            return operator.index(name)
+        near = difflib.get_close_matches(str(name), self.names, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise KeyError(f"unknown mode {name!r}: this set has {', '.join(self.names)}{hint}")

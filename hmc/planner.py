@@ -1,0 +1,224 @@
+"""`plan`: from a task and a state to the best schedule that a budget allows, and what backs it."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from torch import Tensor
+
+from hmc.budget import Budget, Meter
+from hmc.evaluate import Evaluator
+from hmc.schedule import Schedule, Switch, SwitchSpace
+from hmc.sim.base import Sim
+from hmc.solvers import SOLVERS, Search, run
+from hmc.start import Start, Vector, make_start
+from hmc.task import Task
+
+Progress = Callable[["Plan"], bool | None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a search came to, so far or in the end.
+
+    Attributes:
+        schedule: the best schedule found.
+        terms: its cost, term by term.
+        incumbent: the schedule that the search began with.
+        switches: accepted switches, in order; stitched onto `incumbent` they give `schedule`.
+        costs: the incumbent's cost, then the cost after each accepted switch (never rising, Theorem 1).
+        seen: switches of `schedule` that were evaluated and do not improve it.
+        space_size: Z, how many there are.
+        draws: switches evaluated in the whole search, repeats included.
+        rollouts: schedules rolled out; fewer than draws, as equal ones are rolled out once.
+        control_steps: control steps rolled out, over all worlds.
+        diverged: rollouts whose world stopped being finite; their cost is inf.
+        stopped_by: "converged", "iterations", "draws", "control_steps", "seconds", "progress" or
+            "interrupt"; "" while the search goes on.
+        elapsed: wall-clock time [s]; not compared.
+    """
+
+    schedule: Schedule
+    terms: Mapping[str, float]
+    incumbent: Schedule
+    switches: tuple[Switch, ...]
+    costs: tuple[float, ...]
+    seen: int
+    space_size: int
+    draws: int
+    rollouts: int
+    control_steps: int
+    diverged: int
+    stopped_by: str
+    elapsed: float = field(compare=False)
+
+    @property
+    def cost(self) -> float:
+        """J of `schedule`."""
+        return self.costs[-1]
+
+    @property
+    def incumbent_cost(self) -> float:
+        """J of `incumbent`."""
+        return self.costs[0]
+
+    @property
+    def coverage(self) -> float:
+        """n / Z: share of `schedule`'s single switches known not to improve it.
+
+        The chance that a best one of them, if any improves, would have been drawn by now (Theorem 2).
+        """
+        return self.seen / self.space_size
+
+    @property
+    def locally_optimal(self) -> bool:
+        """Whether no single switch improves `schedule` by more than the tolerance (Proposition 1)."""
+        return self.seen == self.space_size
+
+    @property
+    def machine_dependent(self) -> bool:
+        """Whether the result depends on when it was stopped, so that another run may give another."""
+        return self.stopped_by in ("seconds", "progress", "interrupt")
+
+    def __str__(self) -> str:
+        lines = [
+            str(self.schedule),
+            f"cost {self.cost:.6g} (incumbent {self.incumbent_cost:.6g}), {len(self.switches)} switches; "
+            + ("locally optimal" if self.locally_optimal else f"coverage {self.coverage:.1%}")
+            + f" of {self.space_size:,} switches",
+            f"{self.draws:,} draws, {self.control_steps:,} control steps in {self.elapsed:.3g} s"
+            + (f", {self.diverged} rollouts diverged" if self.diverged else "")
+            + (f"; stopped by {self.stopped_by}" if self.stopped_by else ""),
+        ]
+        if self.machine_dependent:
+            lines.append(f"{self.stopped_by} is not a count: a run at another speed may find another plan")
+        return "\n".join(lines)
+
+
+class PlanInterrupted(KeyboardInterrupt):
+    """Ctrl-C during `plan`: goes on up like any other, with the best plan so far in `plan`."""
+
+    def __init__(self, plan: Plan):
+        super().__init__(str(plan))
+        self.plan = plan
+
+
+def plan(
+    task: Task,
+    x: Vector | Start,
+    *,
+    u: Vector | None = None,
+    mode: int | str | None = None,
+    memory: Vector | None = None,
+    k: int = 0,
+    snapshot: Tensor | None = None,
+    schedule: Sequence[int | str] | None = None,
+    solver: str = "sample",
+    samples: int = 64,
+    iterations: int | None = None,
+    budget: Budget | None = None,
+    tolerance: float = 1e-6,
+    seed: int | Sequence[int] = 0,
+    progress: Progress | None = None,
+    sim: Sim | None = None,
+) -> Plan:
+    """Search the mode schedules of `task` from state x, from an incumbent towards lower cost.
+
+    The result is never worse than the incumbent. With the same arguments it is the same, whatever the
+    number of worlds or threads, unless the clock, `progress` or Ctrl-C ended the search.
+
+    Args:
+        task: modes, cost, horizon T and simulator.
+        x: state to plan from, (nx,); or a `Start`, which has u, mode, memory, k and snapshot inside.
+        u: input applied last, (nu,); zero if left out.
+        mode: the mode now running, by index or name.
+        memory: what that mode remembers, (its memory_size,): a schedule that begins with `mode` goes on
+            with it. Left out, the mode is entered anew.
+        k: control steps since the start of the task.
+        snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
+        schedule: the incumbent, T modes by index or name; by default `mode` (else mode 0) throughout.
+        solver: "sample" (Algorithms 1 and 2) takes the first switch drawn that improves; "exhaustive"
+            (Algorithm 1) evaluates all of Omega and takes the best.
+        samples: N, switches drawn a batch.
+        iterations: at most this many switches are accepted; None for as many as improve.
+        budget: limits on draws, control steps and seconds.
+        tolerance: a switch counts if it lowers the cost by more than this share of it.
+        seed: of the draws.
+        progress: called with the plan so far after every batch and accepted switch; False stops.
+        sim: simulator to plan in, made with `task.make_sim`; made anew if left out.
+
+    Raises:
+        PlanInterrupted: on Ctrl-C; a KeyboardInterrupt that carries the best plan so far.
+    """
+    _check(solver, samples, iterations, tolerance)
+    size = len(SwitchSpace(len(task.modes), task.horizon))
+    sim = sim if sim is not None else task.make_sim(min(samples, size))
+    if isinstance(x, Start):
+        if any(value is not None for value in (u, mode, memory, snapshot)) or k != 0:
+            raise ValueError("a Start has u, mode, memory, k and snapshot inside: do not pass them as well")
+        u, mode, memory, k, snapshot = x.u, x.mode, x.memory if x.mode is not None else None, x.k, x.snapshot
+        x = x.x
+    start = make_start(task, sim, x, u, mode, memory, k, snapshot)
+    meter = Meter(budget or Budget(), Evaluator(task, sim, start))
+    incumbent = _incumbent(task, start, mode, schedule)
+    search = Search(meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed))
+    if progress is not None:
+        search.report = lambda search: progress(_plan(search, incumbent))
+    try:
+        run(search, SOLVERS[solver], math.inf if iterations is None else iterations)
+    except KeyboardInterrupt:
+        search.accept()
+        search.stopped_by = "interrupt"
+        raise PlanInterrupted(_plan(search, incumbent)) from None
+    return _plan(search, incumbent)
+
+
+def _incumbent(
+    task: Task, start: Start, mode: int | str | None, schedule: Sequence[int | str] | None
+) -> Schedule:
+    names = task.modes.names
+    if schedule is None:
+        running = start.mode if mode is None else task.modes.index(mode)
+        return Schedule.constant(running or 0, task.horizon, names)
+    if len(schedule) != task.horizon:
+        raise ValueError(
+            f"task {task.name!r}: the incumbent schedule has {len(schedule)} steps, expected the horizon, "
+            f"{task.horizon}"
+        )
+    return Schedule(tuple(task.modes.index(item) for item in schedule), names)
+
+
+def _plan(search: Search, incumbent: Schedule) -> Plan:
+    evaluator = search.evaluator
+    return Plan(
+        schedule=search.schedule,
+        terms=evaluator.terms(search.schedule),
+        incumbent=incumbent,
+        switches=tuple(search.switches),
+        costs=tuple(search.costs),
+        seen=search.seen,
+        space_size=len(search.space),
+        draws=search.meter.draws,
+        rollouts=evaluator.rollouts,
+        control_steps=evaluator.control_steps,
+        diverged=evaluator.diverged,
+        stopped_by=search.stopped_by or "",
+        elapsed=search.meter.elapsed,
+    )
+
+
+def _check(solver: str, samples: int, iterations: int | None, tolerance: float) -> None:
+    if solver not in SOLVERS:
+        near = difflib.get_close_matches(solver, SOLVERS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"unknown solver {solver!r}: expected one of {', '.join(SOLVERS)}{hint}")
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1 switch a batch, got {samples}")
+    if iterations is not None and iterations < 0:
+        raise ValueError(f"iterations must be >= 0, or None for no limit, got {iterations}")
+    if not 0 <= tolerance < math.inf:
+        raise ValueError(f"tolerance must be a finite share >= 0 of the cost, got {tolerance}")

@@ -1,0 +1,113 @@
+"""The receding-horizon loop: shift the schedule, plan again, run the first step's mode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hmc.planner import Plan, plan
+from hmc.sim.base import Sim
+from hmc.start import Vector, make_start
+from hmc.task import Task
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """One control step of the loop.
+
+    Attributes:
+        u: the input to apply, (nu,).
+        mode: index of the mode that chose it.
+        plan: the plan whose first step this is.
+    """
+
+    u: Tensor
+    mode: int
+    plan: Plan
+
+
+class Receding:
+    """Plans at every control step and keeps, between steps, what the next plan goes on from.
+
+    At each tick the last schedule moves one step on (its last mode is repeated at the end) and is the
+    incumbent of the next search. The running mode keeps its memory as long as the schedule stays in it,
+    so a world that follows the prediction makes the plan's own trajectory.
+
+    Attributes:
+        k: control steps since the start of the task.
+        schedule: incumbent of the next tick; None before the first one: `plan`'s default.
+        mode: the mode now running; None before the first tick.
+        memory: what it remembers, (its memory_size,).
+        u: input applied last, (nu,).
+
+    Args:
+        task: what to plan.
+        schedule: incumbent of the first tick, T modes by index or name.
+        seed: of the draws; each tick draws from (seed, k).
+        k: control step of the first tick.
+        sim: simulator to plan in; made once if left out.
+        options: the rest goes to `plan`: solver, samples, iterations, budget, tolerance, progress.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        schedule: Sequence[int | str] | None = None,
+        seed: int = 0,
+        k: int = 0,
+        sim: Sim | None = None,
+        **options: Any,
+    ):
+        self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
+        self.sim = sim if sim is not None else task.make_sim(options.get("samples", 64))
+        self.mode: int | None = None
+        self.memory: Tensor | None = None
+        self.u: Tensor | None = None
+        self._options = options
+
+    @torch.no_grad()
+    def tick(self, x: Vector, u: Vector | None = None, snapshot: Tensor | None = None) -> Tick:
+        """Plan from state x and give the input for this control step.
+
+        Args:
+            x: state, (nx,).
+            u: input applied last, (nu,), if it is not the one that the last tick gave.
+            snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
+        """
+        start = make_start(
+            self.task,
+            self.sim,
+            x,
+            self.u if u is None else u,
+            self.mode,
+            self.memory,
+            self.k,
+            snapshot,
+        )
+        result = plan(
+            self.task,
+            start,
+            schedule=self.schedule,
+            seed=(self.seed, self.k),
+            sim=self.sim,
+            **self._options,
+        )
+        action = self._run(result.schedule[0], start.x, start.u)
+        self.schedule = result.schedule.shift()
+        self.k += 1
+        return Tick(action, result.schedule[0], result)
+
+    def _run(self, mode: int, x: Tensor, u: Tensor) -> Tensor:
+        running = self.task.modes[mode]
+        k = torch.tensor([self.k], device=x.device)
+        memory = None if self.memory is None or mode != self.mode else self.memory[None]
+        if memory is None:
+            memory = running.reset(x[None], u[None], k)
+        action, memory = running.act(x[None], u[None], memory, k)
+        self.u, self.memory, self.mode = action[0].to(x.dtype), memory[0].to(x.dtype), mode
+        return self.u.clone()

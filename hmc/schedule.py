@@ -1,0 +1,221 @@
+"""Mode schedules, single switches of a schedule, and the space Omega of all such switches."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Switch:
+    """Run `mode` in steps start <= k < start + duration: the paper's (m, mu, nu), with nu >= 1."""
+
+    mode: int
+    start: int
+    duration: int
+
+    def __post_init__(self) -> None:
+        if self.mode < 0 or self.start < 0 or self.duration < 1:
+            raise ValueError(f"{self!r}: expected mode >= 0, start >= 0 and duration >= 1")
+
+    @property
+    def stop(self) -> int:
+        """First step after the switch."""
+        return self.start + self.duration
+
+
+@dataclass(frozen=True)
+class Schedule(Sequence[int]):
+    """K in M^T: the mode of each of T control steps. An immutable value, equal where the modes are equal.
+
+    Attributes:
+        modes: T mode indices; any iterable of integers is taken.
+        names: names of all modes, for printing only.
+    """
+
+    modes: tuple[int, ...]
+    names: tuple[str, ...] | None = field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        items: Iterable[int] = self.modes.tolist() if isinstance(self.modes, Tensor) else self.modes
+        modes = tuple(operator.index(mode) for mode in items)
+        if not modes:
+            raise ValueError("a schedule needs at least one control step, got none")
+        limit = len(self.names) if self.names is not None else None
+        for k, mode in enumerate(modes):
+            if mode < 0 or (limit is not None and mode >= limit):
+                known = f"0 to {limit - 1} ({', '.join(self.names or ())})" if limit else "indices >= 0"
+                raise ValueError(f"schedule step {k}: unknown mode {mode}, expected {known}")
+        object.__setattr__(self, "modes", modes)
+
+    @classmethod
+    def constant(cls, mode: int, horizon: int, names: tuple[str, ...] | None = None) -> Schedule:
+        """The same mode at all `horizon` steps."""
+        return cls((mode,) * horizon, names)
+
+    def __len__(self) -> int:
+        return len(self.modes)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.modes)
+
+    @overload
+    def __getitem__(self, k: int) -> int: ...
+    @overload
+    def __getitem__(self, k: slice) -> tuple[int, ...]: ...
+    def __getitem__(self, k: int | slice) -> int | tuple[int, ...]:
+        return self.modes[k]
+
+    def stitch(self, switch: Switch) -> Schedule:
+        """(m, mu, nu) u K: this schedule with the switch's steps overwritten."""
+        if switch.stop > len(self):
+            raise ValueError(f"{switch!r} ends at step {switch.stop}, after the schedule's {len(self)} steps")
+        modes = (*self.modes[: switch.start], *[switch.mode] * switch.duration, *self.modes[switch.stop :])
+        return Schedule(modes, self.names)
+
+    def shift(self, fill: int | None = None) -> Schedule:
+        """One step later: without the first step, with `fill` (default: the last mode) at the end."""
+        return Schedule((*self.modes[1:], self.modes[-1] if fill is None else fill), self.names)
+
+    def runs(self) -> tuple[Switch, ...]:
+        """Stretches of one mode, in order."""
+        runs, start = [], 0
+        for mode, steps in groupby(self.modes):
+            duration = len(list(steps))
+            runs.append(Switch(mode, start, duration))
+            start += duration
+        return tuple(runs)
+
+    def tensor(self, device: torch.device | str = "cpu") -> Tensor:
+        """Mode indices, (T,) long."""
+        return torch.tensor(self.modes, dtype=torch.long, device=device)
+
+    def __str__(self) -> str:
+        label = (lambda m: str(m)) if self.names is None else self.names.__getitem__
+        return " | ".join(f"{label(run.mode)} x{run.duration}" for run in self.runs())
+
+
+def batch(schedules: Iterable[Schedule]) -> Tensor:
+    """Schedules of equal length as rows, (N, T) long."""
+    return torch.tensor([schedule.modes for schedule in schedules], dtype=torch.long)
+
+
+class SwitchSpace:
+    r"""Omega: every switch of a schedule of T steps into one of M modes, Z = M T (T+1) / 2 of them.
+
+    A bijection between 0 <= index < Z and (m, mu, nu) that stores nothing and uses integers only. The
+    T (T+1) / 2 intervals of one mode form a triangle: start mu has T - mu durations. Row i of the
+    triangle and the row that holds W - (T - i) durations, W the odd one of T and T + 1, are laid side by
+    side; the triangle becomes a rectangle of width W, and a division finds row and column.
+    """
+
+    def __init__(self, num_modes: int, horizon: int):
+        if num_modes < 1 or horizon < 1:
+            raise ValueError(
+                f"expected at least 1 mode and 1 step, got num_modes={num_modes}, horizon={horizon}"
+            )
+        self.num_modes = num_modes
+        self.horizon = horizon
+        self._intervals = horizon * (horizon + 1) // 2
+        self._width = horizon | 1
+
+    def __len__(self) -> int:
+        return self.num_modes * self._intervals
+
+    def __getitem__(self, index: int) -> Switch:
+        if not 0 <= index < len(self):
+            raise IndexError(f"switch {index} of a space of {len(self)}")
+        mode, interval = divmod(index, self._intervals)
+        row, column = divmod(interval, self._width)
+        durations = self.horizon - row
+        if column < durations:
+            return Switch(mode, row, column + 1)
+        return Switch(mode, 2 * self.horizon - self._width - row, column - durations + 1)
+
+    def index(self, switch: Switch) -> int:
+        """Inverse of ``space[index]``."""
+        if switch.mode >= self.num_modes or switch.stop > self.horizon:
+            raise ValueError(f"{switch!r} is not among {self.num_modes} modes x {self.horizon} steps")
+        row, column = switch.start, switch.duration - 1
+        if 2 * row >= self.horizon:
+            row = 2 * self.horizon - self._width - row
+            column += self.horizon - row
+        return switch.mode * self._intervals + row * self._width + column
+
+    def split(self, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mode, start and duration of each index: three long tensors in the shape of `indices`."""
+        mode = indices // self._intervals
+        interval = indices % self._intervals
+        row = interval // self._width
+        column = interval % self._width
+        durations = self.horizon - row
+        upper = column < durations
+        start = torch.where(upper, row, 2 * self.horizon - self._width - row)
+        duration = torch.where(upper, column, column - durations) + 1
+        return mode, start, duration
+
+    def stitch(self, schedule: Schedule, indices: Tensor) -> Tensor:
+        """`schedule` with each of the switches `indices` (N,) in turn, (N, T) long."""
+        mode, start, duration = (part[:, None] for part in self.split(indices))
+        k = torch.arange(self.horizon)
+        inside = (start <= k) & (k < start + duration)
+        return torch.where(inside, mode, schedule.tensor())
+
+
+class Draws:
+    """Uniform draws without replacement from 0 <= index < size.
+
+    A Fisher-Yates shuffle of which only the moved entries are kept: O(draws) memory at any size, every
+    order of the whole range equally likely, and each index comes exactly once.
+    """
+
+    def __init__(self, size: int, rng: np.random.Generator):
+        self._size, self._rng = size, rng
+        self._taken = 0
+        self._moved: dict[int, int] = {}
+
+    @property
+    def left(self) -> int:
+        """How many indices have not been drawn yet."""
+        return self._size - self._taken
+
+    def take(self, n: int) -> Tensor:
+        """The next n indices, or all that are left if fewer, (n,) long."""
+        first, self._taken = self._taken, self._taken + min(n, self.left)
+        if first == self._taken:
+            return torch.empty(0, dtype=torch.long)
+        picks = self._rng.integers(np.arange(first, self._taken), self._size)
+        drawn = []
+        for position, pick in enumerate(picks.tolist(), first):
+            here = self._moved.pop(position, position)
+            if pick == position:
+                drawn.append(here)
+            else:
+                drawn.append(self._moved.get(pick, pick))
+                self._moved[pick] = here
+        return torch.tensor(drawn, dtype=torch.long)
+
+
+class InOrder:
+    """Indices 0 <= index < size, ascending, with the interface of `Draws`."""
+
+    def __init__(self, size: int):
+        self._size = size
+        self._taken = 0
+
+    @property
+    def left(self) -> int:
+        """How many indices have not been taken yet."""
+        return self._size - self._taken
+
+    def take(self, n: int) -> Tensor:
+        """The next n indices, or all that are left if fewer, (n,) long."""
+        first, self._taken = self._taken, self._taken + min(n, self.left)
+        return torch.arange(first, self._taken)

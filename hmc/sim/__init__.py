@@ -1,0 +1,1 @@
+"""Engines behind one protocol: C MuJoCo, MuJoCo Warp, and closed-form systems."""

@@ -1,0 +1,81 @@
+"""The one protocol between the planner and whatever simulates the robot."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+
+@runtime_checkable
+class Sim(Protocol):
+    """W worlds that step together, singly or in any subset, one control step at a time.
+
+    Every method takes ``ids``, a long tensor of distinct world indices (n,), or None for all worlds
+    in order. Tensors come back as fresh copies on `device`; a sim never hands out a live buffer.
+
+    The state x is what a mode and a cost may look at (for MuJoCo: qpos then qvel). The input u that
+    was applied last is part of a world too: costs and observations need it.
+
+    A snapshot row holds everything that decides how a world goes on (x, u, time, solver warm start):
+    `load` of a saved row into any world and the same inputs give the same trajectory, bit for bit on
+    the CPU engines. Branching a rollout is `load(ids, save(parent)[...])`.
+
+    A world whose state stops being finite stays so, quietly, and never disturbs another one: the
+    caller finds it by looking at x.
+    """
+
+    @property
+    def num_worlds(self) -> int:
+        """Number of worlds W."""
+        ...
+
+    @property
+    def nx(self) -> int:
+        """Size of the state x."""
+        ...
+
+    @property
+    def nu(self) -> int:
+        """Size of the input u."""
+        ...
+
+    @property
+    def dt(self) -> float:
+        """Duration of one control step [s]."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors live."""
+        ...
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of x, u and snapshots."""
+        ...
+
+    def x(self, ids: Tensor | None = None) -> Tensor:
+        """State, (n, nx)."""
+        ...
+
+    def u(self, ids: Tensor | None = None) -> Tensor:
+        """Input applied last, (n, nu)."""
+        ...
+
+    def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+        """Put worlds at state x (n, nx) with last input u (n, nu): no history, time 0."""
+        ...
+
+    def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+        """Apply u (n, nu) for one control step of dt seconds."""
+        ...
+
+    def save(self, ids: Tensor | None = None) -> Tensor:
+        """Snapshot rows, (n, ns)."""
+        ...
+
+    def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+        """Continue from snapshot rows (n, ns)."""
+        ...

@@ -1,0 +1,132 @@
+"""The single-switch problem, and the search that solves it again and again (Algorithms 1 and 2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hmc.budget import Meter
+from hmc.evaluate import Evaluator
+from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace
+
+
+@dataclass
+class Search:
+    """A search under way: the best schedule so far, and how much of Omega speaks for it.
+
+    Attributes:
+        evaluator: gives the cost of schedules.
+        meter: what may be spent.
+        schedule: the best schedule so far, K_def of the paper.
+        samples: N, switches a batch.
+        tolerance: a switch counts only when it lowers the cost by more than this share of it.
+        rng: where draws come from.
+        report: told after every batch and accepted switch; False ends the search.
+        costs: the incumbent's cost, then the cost after each accepted switch.
+        switches: accepted switches.
+        seen: how many switches of `schedule` were evaluated and do not improve it.
+        stopped_by: why the search ended; None while it runs.
+    """
+
+    evaluator: Evaluator
+    meter: Meter
+    schedule: Schedule
+    samples: int
+    tolerance: float
+    rng: np.random.Generator
+    report: Callable[[Search], bool | None] = lambda _: None
+    costs: list[float] = field(default_factory=list)
+    switches: list[Switch] = field(default_factory=list)
+    seen: int = 0
+    stopped_by: str | None = None
+    _found: tuple[int, float] | None = None
+
+    def __post_init__(self) -> None:
+        self.space = SwitchSpace(len(self.evaluator.task.modes), len(self.schedule))
+        self.costs.append(self.evaluator.cost(self.schedule))
+
+    @property
+    def bound(self) -> float:
+        """What a switch has to get below: the best one found, else the schedule's cost less the tolerance."""
+        if self._found is not None:
+            return self._found[1]
+        cost = self.costs[-1]
+        return cost - self.tolerance * abs(cost) if math.isfinite(cost) else cost
+
+    def batches(self, order: Draws | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
+        """Switches of Omega in an order, N at a time: indices and costs, (n,) each; inf if not known."""
+        while order.left > 0:
+            room, limit = self.meter.room(self.samples)
+            if room <= 0:
+                self.stopped_by = limit
+                return
+            indices = order.take(room)
+            stop = None if self.meter.budget.seconds is None else self.meter.expired
+            costs = self.evaluator.costs(self.space.stitch(self.schedule, indices), self.bound, stop)
+            known = ~costs.isnan()
+            self.meter.draws += int(known.sum())
+            self.seen += int(known.sum())
+            yield indices, torch.where(known, costs, math.inf)
+            if self.stopped_by or not known.all():
+                self.stopped_by = self.stopped_by or "seconds"
+                return
+            self.tell()
+
+    def offer(self, index: Tensor, cost: Tensor) -> bool:
+        """Take note of a switch if it is below `bound`."""
+        if not float(cost) < self.bound:
+            return False
+        self._found = int(index), float(cost)
+        return True
+
+    def accept(self) -> bool:
+        """Go on from the switch taken note of: K_def <- (m, mu, nu) u K_def. False if there is none."""
+        if self._found is None:
+            return False
+        index, cost = self._found
+        self.switches.append(self.space[index])
+        self.schedule = self.schedule.stitch(self.switches[-1])
+        self.costs.append(cost)
+        self.seen, self._found = 0, None
+        return True
+
+    def tell(self) -> None:
+        """Report, and end the search if told so."""
+        if self.report(self) is False:
+            self.stopped_by = "progress"
+
+
+def sample(search: Search) -> None:
+    """Algorithm 2: draw from Omega without replacement, take the first switch that improves."""
+    for indices, costs in search.batches(Draws(len(search.space), search.rng)):
+        for i in (costs < search.bound).nonzero().flatten():
+            search.offer(indices[i], costs[i])
+            return
+
+
+def exhaustive(search: Search) -> None:
+    """Problem 5 solved exactly: the best of all of Omega; of equal ones, that of lowest index."""
+    for indices, costs in search.batches(InOrder(len(search.space))):
+        best = costs.argmin()
+        search.offer(indices[best], costs[best])
+
+
+SOLVERS: dict[str, Callable[[Search], None]] = {"sample": sample, "exhaustive": exhaustive}
+
+
+def run(search: Search, solve: Callable[[Search], None], iterations: float) -> None:
+    """Algorithm 1: solve the single-switch problem and stitch, until no switch improves."""
+    while search.stopped_by is None:
+        if len(search.switches) >= iterations:
+            search.stopped_by = "iterations"
+            return
+        solve(search)
+        if search.accept():
+            search.tell()
+        elif search.stopped_by is None:
+            search.stopped_by = "converged"

@@ -1,0 +1,35 @@
+"""A task: what the planner needs to know besides the state it starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from hmc.cost import Cost
+from hmc.modes import ModeSet
+from hmc.sim.base import Sim
+
+
+@dataclass(frozen=True)
+class Task:
+    """Modes, cost and horizon on one kind of simulator.
+
+    Attributes:
+        name: for messages and files.
+        modes: the controllers to choose from.
+        cost: what to minimise.
+        horizon: length T of a schedule in control steps.
+        make_sim: number of worlds -> a simulator to plan in.
+    """
+
+    name: str
+    modes: ModeSet
+    cost: Cost
+    horizon: int
+    make_sim: Callable[[int], Sim]
+
+    def __post_init__(self) -> None:
+        if self.horizon <= 0:
+            raise ValueError(
+                f"task {self.name!r}: horizon must be at least 1 control step, got {self.horizon}"
+            )

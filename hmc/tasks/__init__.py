@@ -1,0 +1,1 @@
+"""Ready-made tasks, each with modes, cost and simulator."""
