@@ -1,0 +1,95 @@
+"""Learned modes: an ONNX file that carries its contract, run by onnxruntime."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import torch
+from torch import Tensor
+
+from hmc.go2 import model as go2
+from hmc.go2.observe import OBS_SIZE, OBS_VERSION, anchor_of, observe
+from hmc.modes import Mode
+
+DT = 0.02  # s, the control step that policies are trained at
+
+
+def contract() -> dict[str, Any]:
+    """What a policy file must agree with, field by field."""
+    return {
+        "observation_version": OBS_VERSION,
+        "observation_size": OBS_SIZE,
+        "joint_order": list(go2.JOINTS),
+        "kp": go2.KP,
+        "kd": go2.KD,
+        "control_dt": DT,
+    }
+
+
+class Policy(Mode):
+    """A learned mode from a file.
+
+    Target = default_pose + action_scale x network(observation), inside the joint limits. Memory: the
+    anchor, where the mode was entered (see `hmc.go2.observe`).
+
+    Args:
+        path: ONNX file with its contract in the metadata.
+        threads: of onnxruntime.
+
+    Raises:
+        ValueError: the file cannot be read, or a field of its contract does not match; names it.
+    """
+
+    memory_size = 4
+
+    def __init__(self, path: str | Path, threads: int = 1):
+        self.path = Path(path)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        if not self.path.is_file():
+            raise ValueError(f"policy {self.path}: no such file")
+        try:
+            self._session = onnxruntime.InferenceSession(
+                str(self.path), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:
+            raise ValueError(f"policy {self.path}: not a readable ONNX file ({error})") from error
+        self.metadata = {
+            key: json.loads(value) for key, value in self._session.get_modelmeta().custom_metadata_map.items()
+        }
+        self._check()
+        self.name = str(self.metadata["mode"])
+        self._pose = torch.tensor(self.metadata["default_pose"], dtype=torch.float64)
+        self._scale = float(self.metadata["action_scale"])
+
+    def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
+        return anchor_of(x)
+
+    def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        obs = observe(x, u, memory[:, :4]).float().cpu().numpy()
+        (output,) = self._session.run(None, {"obs": obs})
+        action = torch.from_numpy(np.asarray(output)).to(x)
+        target = self._pose.to(x) + self._scale * action
+        return target.clamp(go2.Q_LOWER.to(x), go2.Q_UPPER.to(x)), memory
+
+    def _check(self) -> None:
+        for field, expected in contract().items():
+            if field not in self.metadata:
+                raise ValueError(
+                    f"policy {self.path}: its metadata lacks {field!r}, expected {expected!r}: "
+                    "export it with train/export.py"
+                )
+            came = self.metadata[field]
+            if came != expected:
+                raise ValueError(
+                    f"policy {self.path}: {field} is {came!r}, expected {expected!r}: it was trained for another "
+                    "version of this robot's interface; train and export it again"
+                )
+        for field in ("mode", "default_pose", "action_scale"):
+            if field not in self.metadata:
+                raise ValueError(f"policy {self.path}: its metadata lacks {field!r}: export it with train/export.py")

@@ -1,0 +1,62 @@
+"""The two stances, and what counts as standing in one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hmc.go2 import model as go2
+
+MIN_HEIGHT = 0.45  # m, base
+MAX_TILT = math.radians(20.0)
+
+
+@dataclass(frozen=True)
+class Stance:
+    """Standing on two feet with the body's x axis vertical.
+
+    Attributes:
+        name: of the mode that holds it.
+        sign: +1 nose down (pitch +90 degrees), -1 nose up.
+        pose: joint positions [rad], (12,), balanced over the supporting feet.
+        support: legs that stand, as indices into `LEGS`.
+        free: the other two.
+    """
+
+    name: str
+    sign: int
+    pose: Tensor
+    support: tuple[int, int]
+    free: tuple[int, int]
+
+    def uprightness(self, x: Tensor) -> Tensor:
+        """Cosine of the angle between the body's x axis and this stance's vertical, (n,)."""
+        return -self.sign * go2.rotation(x[:, 3:7])[:, 2, 0]
+
+    def held(self, x: Tensor) -> Tensor:
+        """Whether the robot stands in it for real, (n,) bool.
+
+        On the two supporting feet only: trunk, thighs, shins and the other feet off the ground, base
+        above 0.45 m, body axis within 20 degrees of vertical. A robot on its shins does not count.
+        """
+        gap = go2.clearances(x)
+        clear = (gap["trunk"] > 0) & (gap["thigh"] > 0).all(1) & (gap["calf"] > 0).all(1)
+        clear &= (gap["foot"][:, list(self.free)] > 0).all(1)
+        return clear & (x[:, 2] > MIN_HEIGHT) & (self.uprightness(x) > math.cos(MAX_TILT))
+
+    def state(self) -> Tensor:
+        """The balanced state at rest, (37,), float64."""
+        half = self.sign * math.pi / 4
+        x = torch.zeros(37, dtype=torch.float64)
+        x[2] = go2.STANCE_HEIGHT
+        x[3], x[5] = math.cos(half), math.sin(half)
+        x[7:19] = self.pose
+        return x
+
+
+HANDSTAND = Stance("handstand", +1, go2.HANDSTAND, go2.FRONT, go2.REAR)
+FOOTSTAND = Stance("footstand", -1, go2.FOOTSTAND, go2.REAR, go2.FRONT)
+STANCES = {stance.name: stance for stance in (HANDSTAND, FOOTSTAND)}

@@ -1,0 +1,210 @@
+"""Model predictive path integral control as a mode: a whole batch of worlds re-plans in one rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hmc.cost import Cost
+from hmc.modes import Mode
+from hmc.sim.base import Sim
+
+
+@dataclass(frozen=True)
+class MppiCfg:
+    """Settings of one MPPI mode.
+
+    Attributes:
+        horizon: control steps looked ahead, H.
+        samples: rollouts a re-plan, the nominal among them.
+        temperature: lambda of the weights, in units of the samples' cost spread.
+        knots: points of the linear spline that a plan is, over the horizon.
+        noise: standard deviation of a knot's noise along each row of the noise basis.
+        replan_every: control steps between re-plans; in between the plan runs open loop.
+        iterations: updates a re-plan.
+        worlds: worlds of the simulator it plans in; larger batches are processed in parts.
+    """
+
+    horizon: int = 20
+    samples: int = 25
+    temperature: float = 0.1
+    knots: int = 5
+    noise: float = 0.2
+    replan_every: int = 2
+    iterations: int = 1
+    worlds: int = 256
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "samples", "replan_every", "iterations", "worlds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"mppi.{name} must be at least 1, got {getattr(self, name)}")
+        if not 2 <= self.knots <= self.horizon:
+            raise ValueError(f"mppi.knots must be between 2 and the horizon {self.horizon}, got {self.knots}")
+        if self.replan_every > self.horizon:
+            raise ValueError(f"mppi.replan_every must not exceed the horizon {self.horizon}")
+
+
+class Mppi(Mode):
+    r"""MPPI (Williams et al. 2017) on spline knots, batched over worlds and deterministic.
+
+    A plan is K knots theta with u_i = sum_j B_ij theta_j. A re-plan draws eps_s (eps_0 = 0) from a
+    counter keyed by (seed, k), the same in every world, rolls out the plans theta + eps_s and sets
+
+    .. math:: \theta \leftarrow \theta + \sum_s w_s \epsilon_s, \quad
+              w_s \propto \exp(-(J_s - \min J) / (\lambda \, \mathrm{std} J))
+
+    Between re-plans the plan runs open loop; a re-plan starts from the plan shifted by the steps taken.
+    Memory: the knots, then the number of steps taken since entry.
+
+    Args:
+        name: of the mode.
+        cfg: settings.
+        make_sim: number of worlds -> a simulator to plan in.
+        cost: what the rollouts are judged by; k is the task's, so targets may move.
+        lower, upper: bounds of the input (nu,).
+        guess: (x, u, steps since entry (H,)) -> inputs (H, nu) that the first plan, and each plan's
+            newly appearing end, starts from; default: hold u.
+        basis: (d, nu) directions of the noise; default: every input by itself.
+        seed: of the noise.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        cfg: MppiCfg,
+        make_sim: Callable[[int], Sim],
+        cost: Cost,
+        lower: Tensor,
+        upper: Tensor,
+        *,
+        guess: Tensor | None = None,
+        basis: Tensor | None = None,
+        seed: int = 0,
+    ):
+        self.name, self.cfg, self.cost, self.seed = name, cfg, cost, seed
+        self.lower, self.upper = lower, upper
+        self.nu = len(lower)
+        self.guess = guess
+        self.basis = torch.eye(self.nu) if basis is None else basis
+        self.memory_size = cfg.knots * self.nu + 1
+        self._make_sim = make_sim
+        self._sim: Sim | None = None
+        self.spline = _spline(cfg.horizon, cfg.knots)
+        self.control_steps = 0
+
+    def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
+        n = len(x)
+        theta = u[:, None].expand(n, self.cfg.knots, self.nu) if self.guess is None else self._prior(x, 0)
+        return torch.cat([theta.reshape(n, -1).to(x), x.new_zeros(n, 1)], 1)
+
+    def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        n = len(x)
+        theta = memory[:, :-1].reshape(n, self.cfg.knots, self.nu).clone()
+        taken = memory[:, -1]
+        phase = taken.long() % self.cfg.replan_every
+        now = (phase == 0).nonzero().squeeze(1)
+        if len(now):
+            shifted = self._shift(theta[now], x[now], taken[now])
+            theta[now] = self._replan(x[now], u[now], shifted, k[now])
+        action = (self.spline.to(x)[phase][:, None] @ theta).squeeze(1)
+        action = action.clamp(self.lower.to(x), self.upper.to(x))
+        return action, torch.cat([theta.reshape(n, -1), (taken + 1)[:, None]], 1)
+
+    def _prior(self, x: Tensor, steps: int) -> Tensor:
+        """Knots of the guess from `steps` after entry on, (n, K, nu)."""
+        assert self.guess is not None
+        at = steps + torch.linspace(0, self.cfg.horizon - 1, self.cfg.knots)
+        low = at.floor().long().clamp(max=len(self.guess) - 1)
+        high = (low + 1).clamp(max=len(self.guess) - 1)
+        w = (at - at.floor())[:, None]
+        return ((1 - w) * self.guess[low] + w * self.guess[high]).to(x).expand(len(x), -1, -1)
+
+    def _shift(self, theta: Tensor, x: Tensor, taken: Tensor) -> Tensor:
+        """Plans `replan_every` steps later; what newly appears comes from the guess, else holds."""
+        started = taken > 0
+        if not started.any():
+            return theta
+        at = torch.linspace(0, self.cfg.horizon - 1, self.cfg.knots) + self.cfg.replan_every
+        w = _interpolate(at / (self.cfg.horizon - 1) * (self.cfg.knots - 1), self.cfg.knots).to(theta)
+        moved = w @ theta
+        if self.guess is not None:
+            beyond = (at > self.cfg.horizon - 1).nonzero().squeeze(1)
+            for steps in taken[started].unique():
+                rows = taken == steps
+                fresh = self._prior(x[rows], int(steps))
+                held = moved[rows]
+                held[:, beyond] = fresh[:, beyond]
+                moved[rows] = held
+        return torch.where(started[:, None, None], moved, theta)
+
+    def _replan(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
+        for iteration in range(self.cfg.iterations):
+            eps = self._noise(k, iteration).to(x)
+            plans = theta[:, None] + eps
+            costs = self._rollout(x, u, plans, k)
+            costs = torch.nan_to_num(costs, nan=torch.inf)
+            best = costs.min(1, keepdim=True).values
+            finite = costs.isfinite()
+            excess = torch.where(finite, costs - best, 0.0)
+            spread = (excess.square().sum(1, keepdim=True) / finite.sum(1, keepdim=True).clamp(min=1)).sqrt()
+            weight = torch.exp(-excess / (self.cfg.temperature * spread).clamp(min=1e-9)) * finite
+            weight = weight / weight.sum(1, keepdim=True).clamp(min=1e-9)
+            theta = theta + (weight[:, :, None, None] * eps).sum(1)
+        return theta
+
+    def _noise(self, k: Tensor, iteration: int) -> Tensor:
+        """Noise of each world's samples, (n, S, K, nu): a function of (seed, k, iteration) alone."""
+        steps, inverse = k.unique(return_inverse=True)
+        table = []
+        for step in steps.tolist():
+            counter = (self.seed * 1_000_003 + int(step)) * 101 + iteration
+            generator = torch.Generator().manual_seed(counter % 2**63)
+            z = torch.randn(
+                self.cfg.samples, self.cfg.knots, len(self.basis), generator=generator, dtype=torch.float64
+            )
+            z[0] = 0
+            table.append(self.cfg.noise * z @ self.basis.double())
+        return torch.stack(table)[inverse.cpu()]
+
+    def _rollout(self, x: Tensor, u: Tensor, plans: Tensor, k: Tensor) -> Tensor:
+        """Costs of plans (n, S, K, nu) from states x (n, nx), (n, S), in parts of the simulator's size."""
+        if self._sim is None:
+            self._sim = self._make_sim(self.cfg.worlds)
+        n, s = plans.shape[:2]
+        flat = plans.reshape(n * s, self.cfg.knots, self.nu)
+        owner = torch.arange(n, device=x.device).repeat_interleave(s)
+        parts = []
+        for rows in torch.arange(n * s, device=x.device).split(self._sim.num_worlds):
+            mine = owner[rows]
+            parts.append(self._rollout_part(self._sim, x[mine], u[mine], flat[rows], k[mine]))
+        return torch.cat(parts).reshape(n, s)
+
+    def _rollout_part(self, sim: Sim, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
+        ids = torch.arange(len(x), device=sim.device)
+        sim.reset(x, u, ids)
+        controls = (self.spline.to(theta) @ theta).clamp(self.lower.to(x), self.upper.to(x))
+        total = x.new_zeros(len(x))
+        for i in range(self.cfg.horizon):
+            u_next = controls[:, i]
+            total += self.cost.stage_terms(x, u_next, u, k + i).sum(1) * sim.dt
+            sim.step(u_next, ids)
+            x, u = sim.x(ids), u_next
+        self.control_steps += len(x) * self.cfg.horizon
+        return total + self.cost.terminal_terms(x, k + self.cfg.horizon).sum(1)
+
+
+def _interpolate(at: Tensor, knots: int) -> Tensor:
+    """Rows of linear interpolation weights at positions `at` in knot units, (len(at), knots)."""
+    at = at.clamp(0, knots - 1)
+    low = at.floor().long().clamp(max=knots - 2)
+    w = (at - low)[:, None]
+    eye = torch.eye(knots, dtype=torch.float64)
+    return (1 - w) * eye[low] + w * eye[low + 1]
+
+
+def _spline(horizon: int, knots: int) -> Tensor:
+    """B of the plan u = B theta, (H, K): knot j sits at step j (H - 1) / (K - 1)."""
+    return _interpolate(torch.linspace(0, knots - 1, horizon, dtype=torch.float64), knots)

@@ -1,0 +1,104 @@
+"""The CPU engine: C MuJoCo, many worlds on a thread pool."""
+
+from __future__ import annotations
+
+import mujoco
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
+
+
+class MujocoSim:
+    """W worlds of one MuJoCo model on `mujoco.batch.Batch`; see `hmc.sim.base.Sim`.
+
+    x is qpos then qvel, u is ctrl, both float64. A snapshot row is the engine's whole integration state
+    (time, qpos, qvel, actuator states, warm start, ctrl), so a loaded copy steps bit-identically to its
+    original at any thread count.
+
+    Args:
+        model: compiled model; its autoreset flag must be off, so that a diverged world stays visible.
+        num_worlds: number of worlds W.
+        substeps: physics steps a control step.
+        threads: threads that step worlds, the caller's included; 0 for all cores.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_worlds: int, *, substeps: int = 4, threads: int = 0):
+        if num_worlds < 1:
+            raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
+        if substeps < 1:
+            raise ValueError(f"substeps must be at least 1, got {substeps}")
+        if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET:
+            raise ValueError(
+                "the model resets diverged worlds by itself, which would hide them from the planner: "
+                'set <option><flag autoreset="disable"/></option>'
+            )
+        # diverged worlds are the caller's to report; MuJoCo's own line per substep and world is not
+        mujoco.set_mju_user_warning(_quiet)
+        self.model = model
+        self.batch = Batch(model, num_worlds, threads)
+        self._substeps = substeps
+        self._row = torch.from_numpy(self.batch.state)
+        self._qpos = torch.from_numpy(self.batch.bind("qpos"))
+        self._qvel = torch.from_numpy(self.batch.bind("qvel"))
+        self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
+        self._fresh = self._row[0].clone()
+
+    @property
+    def num_worlds(self) -> int:
+        return self.batch.nsim
+
+    @property
+    def nx(self) -> int:
+        return self.model.nq + self.model.nv
+
+    @property
+    def nu(self) -> int:
+        return self.model.nu
+
+    @property
+    def dt(self) -> float:
+        return self.model.opt.timestep * self._substeps
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device("cpu")
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return torch.float64
+
+    def x(self, ids: Tensor | None = None) -> Tensor:
+        if ids is None:
+            return torch.cat([self._qpos, self._qvel], dim=1)
+        return torch.cat([self._qpos[ids], self._qvel[ids]], dim=1)
+
+    def u(self, ids: Tensor | None = None) -> Tensor:
+        return self._ctrl.clone() if ids is None else self._ctrl[ids]
+
+    def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+        where = slice(None) if ids is None else ids
+        self._row[where] = self._fresh
+        self._qpos[where] = x[:, : self.model.nq].to(torch.float64)
+        self._qvel[where] = x[:, self.model.nq :].to(torch.float64)
+        self._ctrl[where] = u.to(torch.float64)
+
+    def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+        self._ctrl[slice(None) if ids is None else ids] = u.to(torch.float64)
+        self.batch.step(None if ids is None else ids.numpy(), nstep=self._substeps)
+
+    def save(self, ids: Tensor | None = None) -> Tensor:
+        return self._row.clone() if ids is None else self._row[ids]
+
+    def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+        self._row[slice(None) if ids is None else ids] = rows
+
+    def actuator_force(self, ids: Tensor | None = None) -> Tensor:
+        """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
+        force = torch.from_numpy(self.batch.bind("actuator_force"))
+        return force.clone() if ids is None else force[ids]
+
+
+def _quiet(message: str) -> None:
+    del message
+
+

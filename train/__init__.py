@@ -1,0 +1,1 @@
+"""Training of the Go2's learned modes with rsl-rl."""

@@ -1,0 +1,94 @@
+"""Write a trained policy as one ONNX file with its contract: `python train/export.py CHECKPOINT OUT`."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import onnx  # noqa: E402
+import torch  # noqa: E402
+import tyro  # noqa: E402
+from rsl_rl.models import MLPModel  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
+from torch import Tensor, nn  # noqa: E402
+
+from hmc.go2.observe import OBS_SIZE  # noqa: E402
+from hmc.go2.policy import Policy, contract  # noqa: E402
+from hmc.go2.stances import STANCES  # noqa: E402
+from train.runner import read_checkpoint  # noqa: E402
+
+
+def actor_of(checkpoint: dict[str, Any]) -> MLPModel:
+    """The actor network of a checkpoint, in evaluation mode."""
+    state = checkpoint["actor_state_dict"]
+    layers = [value.shape[0] for key, value in state.items() if key.startswith("mlp") and key.endswith("weight")]
+    obs = TensorDict({"policy": torch.zeros(1, OBS_SIZE)}, batch_size=[1])
+    actor = MLPModel(
+        obs, {"actor": ["policy"]}, "actor", 12, hidden_dims=layers[:-1], activation="swish",
+        obs_normalization=True,
+        distribution_cfg=dict(class_name="GaussianDistribution", init_std=1.0, std_type="log"),
+    )
+    actor.load_state_dict(state)
+    return actor.eval()
+
+
+class _Deterministic(nn.Module):
+    """The mean action of an observation batch."""
+
+    def __init__(self, actor: MLPModel):
+        super().__init__()
+        self.net = actor.as_onnx(verbose=False).eval()
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return self.net(obs)
+
+
+def export(checkpoint: Path, out: Path) -> None:
+    """Write `out`; it appears only when complete and checked."""
+    data = read_checkpoint(checkpoint)
+    meta = data["infos"]["meta"]
+    config = json.loads(meta["config"])
+    stance = STANCES[config["env"]["mode"]]
+    module = _Deterministic(actor_of(data))
+    partial = out.with_suffix(".partial.onnx")
+    with redirect_stdout(io.StringIO()):
+        torch.onnx.export(
+            module, (torch.zeros(2, OBS_SIZE),), str(partial), input_names=["obs"], output_names=["actions"],
+            dynamic_shapes=({0: torch.export.Dim("batch")},), external_data=False, dynamo=True, verbose=False,
+        )
+    model = onnx.load(str(partial))
+    fields = {
+        **contract(),
+        "mode": stance.name,
+        "default_pose": [round(float(v), 6) for v in stance.pose],
+        "action_scale": config["env"]["action_scale"],
+        "training_command": meta["command"],
+        "training_seed": int(meta["seed"]),
+        "training_config": config,
+        "training_config_sha256": meta["config_sha256"],
+        "environment_steps": int(data["infos"]["steps"]),
+    }
+    del model.metadata_props[:]
+    for key, value in fields.items():
+        model.metadata_props.add(key=key, value=json.dumps(value))
+    onnx.save(model, str(partial))
+    Policy(partial)  # refuses what it would refuse later
+    os.replace(partial, out)
+
+
+def main(checkpoint: Path, out: Path, /) -> None:
+    """Export CHECKPOINT (written by train/ppo.py) to OUT."""
+    export(checkpoint, out)
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,159 @@
+"""rsl-rl's runner with a live table, atomic checkpoints, and everything a resumed run needs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import random
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rsl_rl.runners import OnPolicyRunner
+
+from train.env import StanceEnv
+
+CHECKPOINT_KEYS = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter", "infos")
+
+
+class Runner(OnPolicyRunner):
+    """`OnPolicyRunner` for one `StanceEnv`.
+
+    A checkpoint also holds the random state, the start-state curriculum and the number of environment
+    steps, and is written to a temporary file that replaces the old one only when it is complete.
+
+    Args:
+        env: the environment.
+        cfg: rsl-rl's configuration.
+        log_dir: folder for checkpoints and tensorboard events.
+        device: of networks and storage.
+        meta: what the exported policy will say about its training.
+    """
+
+    env: StanceEnv
+
+    def __init__(self, env: StanceEnv, cfg: dict[str, Any], log_dir: str, device: str, meta: dict[str, str]):
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
+            super().__init__(env, cfg, log_dir, device)
+        self.meta = meta
+        self.table = LiveTable(self)
+        self._log = self.logger.log
+        self.logger.log = self._log_quietly  # type: ignore[method-assign]
+
+    def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
+        infos = {
+            **(infos or {}),
+            "meta": self.meta,
+            "steps": self.logger.tot_timesteps,
+            "seconds": self.logger.tot_time,
+            "starts": self.env.starts.state_dict(),
+            "rng": {"torch": torch.get_rng_state(), "numpy": np.random.get_state(), "python": random.getstate()},
+        }
+        partial = f"{path}.partial"
+        super().save(partial, infos)
+        os.replace(partial, path)
+        latest = Path(path).with_name("latest.pt")
+        if latest != Path(path):
+            with contextlib.suppress(FileNotFoundError):
+                latest.unlink()
+            os.link(path, latest)
+
+    def resume(self, path: str, *, fresh_optimizer: bool = False) -> None:
+        """Go on from a checkpoint; an error names the file and what is wrong with it."""
+        data = read_checkpoint(path)
+        self.load(path, {"actor": True, "critic": True, "optimizer": not fresh_optimizer, "iteration": True},
+                  map_location=self.device)
+        infos = data["infos"]
+        self.current_learning_iteration += 1
+        self.logger.tot_timesteps, self.logger.tot_time = infos["steps"], infos["seconds"]
+        self.env.starts.load_state_dict(infos["starts"])
+        torch.set_rng_state(infos["rng"]["torch"].cpu())
+        np.random.set_state(infos["rng"]["numpy"])
+        random.setstate(infos["rng"]["python"])
+
+    def _log_quietly(self, **kwargs: Any) -> None:
+        self.table.update(kwargs, self.logger.ep_extras)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._log(**kwargs)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The contents of a checkpoint file.
+
+    Raises:
+        ValueError: the file is missing, cut short or not one of ours.
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"checkpoint {path}: no such file")
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=False)
+    except Exception as error:
+        size = Path(path).stat().st_size
+        raise ValueError(
+            f"checkpoint {path}: cannot be read ({type(error).__name__}); its {size} bytes look cut short: "
+            "resume from an older model_*.pt in the same folder"
+        ) from error
+    missing = [key for key in CHECKPOINT_KEYS if not isinstance(data, dict) or key not in data]
+    if missing:
+        raise ValueError(f"checkpoint {path}: lacks {', '.join(missing)}; expected a file written by train/ppo.py")
+    return data
+
+
+class LiveTable:
+    """Progress on a terminal as one table that updates itself, elsewhere as a line now and then."""
+
+    def __init__(self, runner: Runner):
+        self.runner = runner
+        self.console = Console()
+        self.live = Live(console=self.console, refresh_per_second=2) if self.console.is_terminal else None
+        self.printed = 0.0
+
+    def update(self, log: dict[str, Any], extras: list[dict[str, Any]]) -> None:
+        """Show one iteration: what the runner logs and the environment's own log entries."""
+        sums: dict[str, list[float]] = defaultdict(list)
+        for entry in extras:
+            for key, value in entry.items():
+                sums[key].append(float(value.mean() if isinstance(value, torch.Tensor) else value))
+        means = {key: sum(values) / len(values) for key, values in sums.items()}
+        size = self.runner.cfg["num_steps_per_env"] * self.runner.env.num_envs * self.runner.logger.gpu_world_size
+        rate = size / (log["collect_time"] + log["learn_time"])
+        left = (log["total_it"] - log["it"] - 1) * size / rate
+        head = {
+            "iteration": f"{log['it'] + 1} / {log['total_it']}",
+            "environment steps": f"{(self.runner.logger.tot_timesteps + size) / 1e6:.2f} M",
+            "steps/s": f"{rate:,.0f}",
+            "time left": time.strftime("%H:%M:%S", time.gmtime(left)),
+            "action std": f"{float(log['action_std'].mean()):.3f}",
+        }
+        if self.live is not None:
+            self.live.update(_table(self.runner.env.cfg.mode, head, means))
+        elif time.monotonic() - self.printed > 20 or log["it"] + 1 == log["total_it"]:
+            self.printed = time.monotonic()
+            success = ", ".join(f"{k[9:]} {v:.2f}" for k, v in means.items() if k.startswith("/success/"))
+            self.console.print(
+                f"{head['iteration']}  {head['environment steps']}  {head['steps/s']} steps/s  "
+                f"left {head['time left']}  episode {means.get('/episode/length', 0):.0f}  {success}",
+                soft_wrap=True,
+                highlight=False,
+            )
+
+
+def _table(title: str, head: dict[str, str], means: dict[str, float]) -> Table:
+    table = Table(title=f"training {title}", show_header=False)
+    for key, value in head.items():
+        table.add_row(key, value)
+    group = ""
+    for key, value in means.items():
+        _, kind, *rest = key.split("/")
+        if kind != group:
+            table.add_section()
+            group = kind
+        table.add_row(" ".join([kind, *rest]), f"{value:.3f}")
+    return table

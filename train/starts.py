@@ -1,0 +1,189 @@
+"""Start states: the stance, states on the way to it, the four-legged stand, recorded states.
+
+The states on the way form a grid over (place, energy) whose cells open one by one, backwards from the
+stance, as the policy learns to reach it from their neighbours; cells that are neither mastered nor
+hopeless are drawn most often.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hmc.go2 import model as go2
+from hmc.go2.stances import FOOTSTAND, HANDSTAND, Stance
+
+GRAVITY = 9.81
+GYRATION2 = 0.033  # squared radius of gyration about the pitch axis [m^2]
+
+STANCE, WAY, HOME, RECORDED = range(4)
+KINDS = ("stance", "way", "home", "recorded")
+
+
+@dataclass(frozen=True)
+class StartsCfg:
+    """How episodes begin.
+
+    Attributes:
+        stance: share of episodes that begin in the stance, disturbed.
+        way: share on the way to the stance, with the body already rotating towards it.
+        home: share in the four-legged stand.
+        recorded: share drawn from the file of recorded states.
+        furthest: place where the way begins: 1 the stance, 0 horizontal, -1 the other stance.
+        tilt: disturbance of roll and pitch in the stance, uniform [rad].
+        speed: disturbance of linear [m/s] and angular [rad/s] velocity, uniform.
+        joints: disturbance of joint positions, uniform [rad].
+        records: .pt file with states "x" (n, 37) and inputs "u" (n, 12); empty for none.
+    """
+
+    stance: float = 0.5
+    way: float = 0.0
+    home: float = 0.5
+    recorded: float = 0.0
+    furthest: float = 0.0
+    tilt: float = 0.26
+    speed: float = 0.4
+    joints: float = 0.1
+    records: str = ""
+
+
+class Start(NamedTuple):
+    """A batch of starts: states (n, 37), inputs (n, 12), kind (n,) and cell of the way's grid (n,)."""
+
+    x: Tensor
+    u: Tensor
+    kind: Tensor
+    cell: Tensor
+
+
+class Starts:
+    """Draws start states for one stance and learns from how the episodes ended.
+
+    Args:
+        stance: what the policy is to hold.
+        cfg: shares and disturbances.
+        device: where the tensors live.
+    """
+
+    PLACES, ENERGIES = 20, 5
+    ENERGY_LOW, ENERGY_HIGH = 0.4, 1.4
+
+    def __init__(self, stance: Stance, cfg: StartsCfg, device: torch.device):
+        self.stance, self.cfg, self.device = stance, cfg, device
+        self.other = FOOTSTAND if stance is HANDSTAND else HANDSTAND
+        self.success = torch.zeros(self.PLACES, self.ENERGIES, device=device)
+        self.rates = torch.zeros(len(KINDS), device=device)
+        self.shares = torch.tensor([cfg.stance, cfg.way, cfg.home, cfg.recorded], device=device)
+        self.records: dict[str, Tensor] | None = None
+        if cfg.records:
+            self.records = torch.load(cfg.records, map_location=device, weights_only=True)
+        elif cfg.recorded > 0:
+            raise ValueError("starts.recorded > 0 needs starts.records, the file with the recorded states")
+
+    def sample(self, n: int) -> Start:
+        """Draw n starts."""
+        kind = torch.multinomial(self.shares, n, replacement=True)
+        place = torch.ones(n, device=self.device)
+        energy = torch.zeros(n, device=self.device)
+        cell = torch.multinomial(self.weights().flatten(), n, replacement=True)
+        column = torch.div(cell, self.ENERGIES, rounding_mode="floor")
+        on_way = kind == WAY
+        span = (1.0 - self.cfg.furthest) / self.PLACES
+        place[on_way] = (1.0 - (column + self._uniform(n, 0, 1)) * span)[on_way]
+        width = (self.ENERGY_HIGH - self.ENERGY_LOW) / self.ENERGIES
+        energy[on_way] = (self.ENERGY_LOW + (cell % self.ENERGIES + self._uniform(n, 0, 1)) * width)[on_way]
+        place[kind == HOME] = 0.0
+        x = self._place(place, energy, hop=on_way & (self._uniform(n, 0, 1) < 0.5))
+        u = (x[:, 7:19] + self._uniform((n, 12), -0.3, 0.3)).clamp(
+            go2.Q_LOWER.to(self.device), go2.Q_UPPER.to(self.device)
+        )
+        if self.records is not None:
+            recorded = (kind == RECORDED).nonzero().squeeze(1)
+            pick = torch.randint(len(self.records["x"]), (len(recorded),), device=self.device)
+            x[recorded] = self.records["x"][pick].to(x)
+            u[recorded] = self.records["u"][pick].to(u)
+        return Start(x, u, kind, cell)
+
+    def weights(self) -> Tensor:
+        """Weight of each cell of the way, (places, energies): open cells by how much is to be learned."""
+        p = self.success
+        near = torch.nn.functional.max_pool2d(p[None, None], 3, 1, 1)[0, 0]
+        opened = near > 0.35
+        opened[:2] = True
+        return (p * (1 - p) + 0.04) * opened
+
+    def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
+        """Learn from ended episodes: their kind, cell and whether they ended standing, all (n,)."""
+        success = success.float()
+        for c in cell[kind == WAY].unique():
+            mine = (kind == WAY) & (cell == c)
+            row, column = divmod(int(c), self.ENERGIES)
+            keep = 0.95 ** int(mine.sum())
+            self.success[row, column] = keep * self.success[row, column] + (1 - keep) * success[mine].mean()
+        for k in kind.unique():
+            keep = 0.995 ** int((kind == k).sum())
+            self.rates[k] = keep * self.rates[k] + (1 - keep) * success[kind == k].mean()
+
+    def frontier(self) -> float:
+        """Furthest place from which some energy succeeds in more than a third of the episodes."""
+        good = (self.success > 0.35).any(1).nonzero()
+        rows = int(good.max()) + 1 if len(good) else 0
+        return 1.0 - rows * (1.0 - self.cfg.furthest) / self.PLACES
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What a checkpoint must keep."""
+        return {"success": self.success, "rates": self.rates}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from a checkpoint."""
+        self.success.copy_(state["success"])
+        self.rates.copy_(state["rates"])
+
+    def _uniform(self, shape: int | tuple[int, ...], low: float, high: float) -> Tensor:
+        return torch.rand(shape, device=self.device) * (high - low) + low
+
+    def _place(self, place: Tensor, energy: Tensor, hop: Tensor) -> Tensor:
+        r"""States on the line from this stance (place 1) over horizontal (0) to the other one (-1).
+
+        The body turns towards the stance about the feet that support it there. From horizontal on,
+        `energy` is the rotation's share of what lifts the base to the stance's height h:
+        omega^2 (r^2 + rho^2) = 2 energy g (h - z); before that it is the share of what a fall from
+        the other stance gives, plus a push. Hopping states are lifted off the ground, moving up or down.
+        """
+        n, cfg, stance = len(place), self.cfg, self.stance
+        wobble = (0.4 + 0.6 * (energy == 0)) * cfg.tilt
+        own, pose = stance.pose.to(self.device), self.other.pose.to(self.device)
+        home = go2.HOME.to(self.device)
+        toward = place[:, None]
+        q = home + toward.clamp(min=0) * (own - home) + (-toward).clamp(min=0) * (pose - home)
+        q = (q + self._uniform((n, 12), -1, 1) * cfg.joints).clamp(
+            go2.Q_LOWER.to(self.device), go2.Q_UPPER.to(self.device)
+        )
+        pitch = stance.sign * place * math.pi / 2 + self._uniform(n, -1, 1) * wobble
+        roll = self._uniform(n, -1, 1) * 0.5 * wobble
+        x = torch.zeros(n, 37, device=self.device)
+        cp, sp, cr, sr = (pitch / 2).cos(), (pitch / 2).sin(), (roll / 2).cos(), (roll / 2).sin()
+        x[:, 3:7] = torch.stack([cp * cr, cp * sr, sp * cr, -sp * sr], -1)
+        x[:, 7:19] = q
+        lift = hop * self._uniform(n, 0, 0.2)
+        gap = go2.clearances(x)
+        lowest = torch.cat([gap["foot"], gap["thigh"], gap["calf"], gap["trunk"][:, None]], 1).amin(1)
+        x[:, 2] = lift + 0.001 - lowest
+        feet = go2.leg_points(q)[:, :, 2] @ go2.rotation(x[:, 3:7]).transpose(1, 2)
+        near = torch.where(toward[:, :, None] >= 0, feet[:, list(stance.support)], feet[:, list(stance.free)])
+        arm = -near.mean(1)  # from the pivot to the base
+        rise = (go2.STANCE_HEIGHT - x[:, 2]).clamp(min=0.02)
+        inertia = arm.square().sum(1) + GYRATION2
+        push = torch.where(place < 0, 1.0 * energy, torch.zeros_like(energy))
+        omega = stance.sign * ((2 * energy * GRAVITY * rise / inertia).sqrt() + push) * (energy > 0)
+        x[:, 19] = omega * arm[:, 2]
+        x[:, 21] = -omega * arm[:, 0] + hop * self._uniform(n, -0.8, 1.0)
+        x[:, 19:22] += self._uniform((n, 3), -1, 1) * cfg.speed
+        x[:, 22:25] = self._uniform((n, 3), -1, 1) * cfg.speed
+        x[:, 23] += omega
+        x[:, 25:37] = self._uniform((n, 12), -1, 1) * cfg.speed
+        return x
