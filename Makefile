@@ -10,6 +10,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+INSTALL := $(PIP) install -q --no-compile -c constraints.txt # modules compile when first imported
 TORCH := $(shell grep '^torch==' constraints.txt)
 EXTRAS := warp,train,demo,dev
 
@@ -52,8 +53,9 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("hmc needs Python 3.11 or \
 	newer, $(PYTHON) is %d.%d: name another with make PYTHON=/path/to/python3.12" % v[:2])'
 	@rm -f $@
+	@echo "Setting up $(VENV): once, some minutes. It holds $(TORCH) and the rest of constraints.txt."
 	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "$(PYTHON) cannot make virtual environments: name another, make PYTHON=..." >&2; exit 1; }
-	$(PIP) install -q -c constraints.txt $(TORCH) setuptools
-	$(PIP) install -q -c constraints.txt --no-build-isolation -e '.[$(EXTRAS)]'
+	$(INSTALL) $(TORCH) setuptools
+	$(INSTALL) --no-build-isolation -e '.[$(EXTRAS)]'
 	@touch $@
