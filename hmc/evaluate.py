@@ -98,7 +98,6 @@ class Evaluator:
         self.rollouts += len(keys)
         self.diverged += int(rolled.diverged.sum())
         self.pruned += int(rolled.pruned.sum())
-        rolled.terms[rolled.diverged] = math.nan
         rows = zip(rolled.cost.tolist(), rolled.terms.tolist(), rolled.pruned.tolist(), strict=True)
         for key, (cost, terms, pruned) in zip(keys, rows, strict=True):
             self._known[key] = _Known(cost, None if pruned else terms)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hmc.modes import Mode
 from hmc.sim.base import Sim
 from hmc.start import Start
 from hmc.task import Task
@@ -53,32 +54,48 @@ class Worlds:
         Returns:
             The inputs to apply, (n, nu). The worlds' memory is already that after the step.
         """
-        memory = self.memory[ids]
-        entered = modes != self.mode[ids]
+        memory = self._arrive(ids, modes, x, u, k)
         action = torch.empty_like(u)
         for index, mode in enumerate(self.task.modes):
-            rows = (modes == index).nonzero().squeeze(1)
-            if len(rows) == 0:
+            rows = _rows(modes == index)
+            if rows is None:
                 continue
-            remembered = memory[rows, : mode.memory_size]
-            new = entered[rows].nonzero().squeeze(1)
-            if len(new) > 0 and mode.memory_size > 0:
-                at = rows[new]
-                fresh = mode.reset(x[at], u[at], k[at])
-                remembered[new] = _shaped(mode.name, "reset() memory", fresh, (len(new), mode.memory_size))
-            chosen, remembered = mode.act(x[rows], u[rows], remembered, k[rows])
-            action[rows] = _shaped(mode.name, "act() actions", chosen, (len(rows), self.sim.nu)).to(u.dtype)
-            memory[rows, : mode.memory_size] = _shaped(
-                mode.name, "act() memory", remembered, (len(rows), mode.memory_size)
-            ).to(memory.dtype)
-        self.mode[ids] = modes
+            size = mode.memory_size
+            chosen, after = mode.act(x[rows], u[rows], memory[rows, :size], k[rows])
+            n = len(k[rows])
+            action[rows] = _shaped(mode, "act() actions", chosen, (n, self.sim.nu)).to(u.dtype)
+            if size > 0:
+                memory[rows, :size] = _shaped(mode, "act() memory", after, (n, size)).to(memory.dtype)
         self.memory[ids] = memory
         return action
 
+    def _arrive(self, ids: Tensor, modes: Tensor, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
+        """Memory at the start of the step, (n, memory_size): made anew where a world changes mode."""
+        memory = self.memory[ids]
+        entered = modes != self.mode[ids]
+        if bool(entered.any()):
+            self.mode[ids] = modes
+            memory[entered] = 0.0
+            for index, mode in enumerate(self.task.modes):
+                rows = _rows(entered & (modes == index)) if mode.memory_size > 0 else None
+                if rows is not None:
+                    fresh = mode.reset(x[rows], u[rows], k[rows])
+                    size = (len(k[rows]), mode.memory_size)
+                    memory[rows, : size[1]] = _shaped(mode, "reset() memory", fresh, size).to(memory.dtype)
+        return memory
 
-def _shaped(mode: str, what: str, value: Tensor, shape: tuple[int, int]) -> Tensor:
+
+def _rows(mask: Tensor) -> Tensor | slice | None:
+    """Index of the rows where `mask` (n,) holds: None if nowhere, a cheap slice if everywhere."""
+    rows = mask.nonzero().squeeze(1)
+    if len(rows) == 0:
+        return None
+    return slice(None) if len(rows) == len(mask) else rows
+
+
+def _shaped(mode: Mode, what: str, value: Tensor, shape: tuple[int, int]) -> Tensor:
     if value.shape != shape:
-        raise ValueError(f"mode {mode!r}: {what} have shape {tuple(value.shape)}, expected {shape}")
+        raise ValueError(f"mode {mode.name!r}: {what} have shape {tuple(value.shape)}, expected {shape}")
     return value
 
 
@@ -105,7 +122,7 @@ class Rolled:
 
     Attributes:
         cost: J, (n,) float64; inf where diverged, the partial cost where pruned.
-        terms: each term's share, (n, number of terms) float64; of no meaning where diverged or pruned.
+        terms: each term's share, (n, number of terms) float64; NaN where diverged or pruned.
         diverged: worlds whose state, input or cost stopped being finite, (n,) bool.
         pruned: worlds given up because their partial cost exceeded the bound, (n,) bool.
     """
@@ -134,46 +151,52 @@ def roll(
     """
     sim, cost = worlds.sim, worlds.task.cost
     n, horizon = schedules.shape
-    schedules = schedules.to(sim.device)
+    modes = schedules.to(sim.device)
     limit = bound if cost.nonnegative else math.inf
-    terms = torch.zeros(n, len(cost.names), dtype=torch.float64, device=sim.device)
-    stages = len(cost.stage)
+    stages, names = len(cost.stage), len(cost.names)
     result = torch.full((n,), math.inf, dtype=torch.float64, device=sim.device)
+    parts = torch.full((n, names), math.nan, dtype=torch.float64, device=sim.device)
     pruned = torch.zeros(n, dtype=torch.bool, device=sim.device)
-    live = torch.arange(n, device=sim.device)
-    worlds.reset(start, live)
+    ids = torch.arange(n, device=sim.device)  # worlds still going; the rows of modes and terms are theirs
+    terms = torch.zeros(n, names, dtype=torch.float64, device=sim.device)
+    worlds.reset(start, ids)
     for i in range(horizon):
         if stop is not None and stop():
             return None
-        live, x = _keep(finite(x := sim.x(live)), live, x)
-        if len(live) == 0:
-            break
-        u_prev, k = sim.u(live), torch.full_like(live, start.k + i)
-        u = worlds.act(live, schedules[live, i], x, u_prev, k)
-        terms[live, :stages] += stage_terms(worlds.task, x, u, u_prev, k, sim.dt)
-        partial = total(terms[live])
-        beyond = partial > limit
-        result[live[beyond]], pruned[live[beyond]] = partial[beyond], True
-        live, u = _keep(finite(u) & partial.isfinite() & ~beyond, live, u)
-        if len(live) == 0:
-            break
-        sim.step(u, live)
-        worlds.control_steps += len(live)
-    if len(live) > 0:
-        live, x = _keep(finite(x := sim.x(live)), live, x)
-    if len(live) > 0:
-        k = torch.full_like(live, start.k + horizon)
-        terms[live, stages:] = cost.terminal_terms(x, k).to(torch.float64)
-        result[live] = total(terms[live])
-    diverged = ~result.isfinite()
-    result[diverged] = math.inf
-    return Rolled(result, terms, diverged & ~pruned, pruned)
+        x = sim.x(ids)
+        if not bool(x.isfinite().all()):
+            ids, modes, terms, x = _keep(finite(x), ids, modes, terms, x)
+            if len(ids) == 0:
+                break
+        u_prev, k = sim.u(ids), torch.full_like(ids, start.k + i)
+        u = worlds.act(ids, modes[:, i], x, u_prev, k)
+        terms[:, :stages] += stage_terms(worlds.task, x, u, u_prev, k, sim.dt)
+        partial = total(terms)
+        sound, beyond = partial.isfinite() & finite(u), partial > limit
+        if not bool((sound & ~beyond).all()):
+            given_up = sound & beyond
+            result[ids[given_up]], pruned[ids[given_up]] = partial[given_up], True
+            ids, modes, terms, u = _keep(sound & ~beyond, ids, modes, terms, u)
+            if len(ids) == 0:
+                break
+        sim.step(u, ids)
+        worlds.control_steps += len(ids)
+    if len(ids) > 0:
+        x = sim.x(ids)
+        ids, terms, x = _keep(finite(x), ids, terms, x)
+    if len(ids) > 0:
+        k = torch.full_like(ids, start.k + horizon)
+        terms[:, stages:] = cost.terminal_terms(x, k).to(torch.float64)
+        result[ids], parts[ids] = total(terms), terms
+    diverged = ~result.isfinite() & ~pruned
+    result[diverged], parts[diverged] = math.inf, math.nan
+    return Rolled(result, parts, diverged, pruned)
+
+
+def _keep(ok: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+    return tuple(tensor[ok] for tensor in tensors)
 
 
 def stage_terms(task: Task, x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor, dt: float) -> Tensor:
     """l dt, term by term, (n, number of stage terms) float64."""
     return task.cost.stage_terms(x, u, u_prev, k).to(torch.float64) * dt
-
-
-def _keep(ok: Tensor, live: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    return (live, values) if bool(ok.all()) else (live[ok], values[ok])
