@@ -65,8 +65,8 @@ class Mppi(Mode):
         make_sim: number of worlds -> a simulator to plan in.
         cost: what the rollouts are judged by; k is the task's, so targets may move.
         lower, upper: bounds of the input (nu,).
-        guess: (x, u, steps since entry (H,)) -> inputs (H, nu) that the first plan, and each plan's
-            newly appearing end, starts from; default: hold u.
+        guess: inputs (G, nu) by control steps since entry, held at the end: the first plan, and what
+            newly appears at each later plan's end, start from it; default: hold u.
         basis: (d, nu) directions of the noise; default: every input by itself.
         seed: of the noise.
     """
@@ -108,7 +108,7 @@ class Mppi(Mode):
         now = (phase == 0).nonzero().squeeze(1)
         if len(now):
             shifted = self._shift(theta[now], x[now], taken[now])
-            theta[now] = self._replan(x[now], u[now], shifted, k[now])
+            theta[now] = self._replan_once(x[now], u[now], shifted, k[now])
         action = (self.spline.to(x)[phase][:, None] @ theta).squeeze(1)
         action = action.clamp(self.lower.to(x), self.upper.to(x))
         return action, torch.cat([theta.reshape(n, -1), (taken + 1)[:, None]], 1)
@@ -139,6 +139,17 @@ class Mppi(Mode):
                 held[:, beyond] = fresh[:, beyond]
                 moved[rows] = held
         return torch.where(started[:, None, None], moved, theta)
+
+    def _replan_once(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
+        """`_replan`, done once for worlds that are in the same situation, as schedules with a common
+        beginning are."""
+        n = len(x)
+        rows = torch.cat([x, u, theta.reshape(n, -1), k[:, None].to(x)], 1)
+        unique, inverse = torch.unique(rows, dim=0, return_inverse=True)
+        first = torch.full((len(unique),), n, device=x.device).scatter_reduce(
+            0, inverse, torch.arange(n, device=x.device), "amin"
+        )
+        return self._replan(x[first], u[first], theta[first], k[first])[inverse]
 
     def _replan(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
         for iteration in range(self.cfg.iterations):

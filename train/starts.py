@@ -67,13 +67,15 @@ class Starts:
         stance: what the policy is to hold.
         cfg: shares and disturbances.
         device: where the tensors live.
+        unlocked: draw all kinds from the beginning, as to measure a policy.
     """
 
     PLACES, ENERGIES = 20, 5
     ENERGY_LOW, ENERGY_HIGH = 0.4, 1.4
 
-    def __init__(self, stance: Stance, cfg: StartsCfg, device: torch.device):
+    def __init__(self, stance: Stance, cfg: StartsCfg, device: torch.device, *, unlocked: bool = False):
         self.stance, self.cfg, self.device = stance, cfg, device
+        self.unlocked = unlocked
         self.other = FOOTSTAND if stance is HANDSTAND else HANDSTAND
         self.success = torch.zeros(self.PLACES, self.ENERGIES, device=device)
         self.rates = torch.zeros(len(KINDS), device=device)
@@ -86,7 +88,7 @@ class Starts:
 
     def sample(self, n: int) -> Start:
         """Draw n starts."""
-        kind = torch.multinomial(self.shares, n, replacement=True)
+        kind = torch.multinomial(self._shares(), n, replacement=True)
         place = torch.ones(n, device=self.device)
         energy = torch.zeros(n, device=self.device)
         cell = torch.multinomial(self.weights().flatten(), n, replacement=True)
@@ -115,6 +117,15 @@ class Starts:
         opened = near > 0.35
         opened[:2] = True
         return (p * (1 - p) + 0.04) * opened
+
+    def _shares(self) -> Tensor:
+        """Shares of the kinds: four-legged and recorded starts wait until the stance itself is held.
+
+        Their early episodes are long and teach nothing; they would be most of a batch.
+        """
+        if self.unlocked or self.rates[STANCE] > 0.5:
+            return self.shares
+        return self.shares * self.shares.new_tensor([1.0, 1.0, 0.0, 0.0])
 
     def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
         """Learn from ended episodes: their kind, cell and whether they ended standing, all (n,)."""

@@ -38,6 +38,7 @@ class Policy(Mode):
 
     Args:
         path: ONNX file with its contract in the metadata.
+        name: of the mode; default: the file's.
         threads: of onnxruntime.
 
     Raises:
@@ -46,7 +47,7 @@ class Policy(Mode):
 
     memory_size = 4
 
-    def __init__(self, path: str | Path, threads: int = 1):
+    def __init__(self, path: str | Path, *, name: str = "", threads: int = 1):
         self.path = Path(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
@@ -63,7 +64,7 @@ class Policy(Mode):
             key: json.loads(value) for key, value in self._session.get_modelmeta().custom_metadata_map.items()
         }
         self._check()
-        self.name = str(self.metadata["mode"])
+        self.name = name or str(self.metadata["mode"])
         self._pose = torch.tensor(self.metadata["default_pose"], dtype=torch.float64)
         self._scale = float(self.metadata["action_scale"])
 

@@ -1,0 +1,198 @@
+"""The flip: from the foot stand through a jump to the handstand, as a `Task`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import resources
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hmc.cost import Cost
+from hmc.go2 import model as go2
+from hmc.go2.policy import Policy
+from hmc.go2.stances import FOOTSTAND, HANDSTAND, Stance
+from hmc.modes import ModeSet
+from hmc.mppi import Mppi, MppiCfg
+from hmc.sim.base import Sim
+from hmc.sim.mujoco import MujocoSim
+from hmc.task import Task
+
+
+@dataclass(frozen=True)
+class CostCfg:
+    """Weights of Table I, and how long the planner takes the last state to go on.
+
+    Attributes:
+        height: of (z_target - z)^2 [1/m^2].
+        orientation: of the squared distance of the gravity direction's body x, y from the target's.
+        joints: of |q - q_nominal|^2 [1/rad^2], q_nominal the target stance's pose.
+        rate: of |u_k - u_{k-1}|^2 [1/rad^2].
+        energy: of the norm of joint powers [1/W].
+        pose: of exp(-|q - q_default|^2), as printed.
+        tail: the terminal cost is the height, orientation and joint terms at the end, held for this
+            long [s]. Without it a fall now is better than a flip that ends just behind the horizon.
+    """
+
+    height: float = 1.5
+    orientation: float = 1.0
+    joints: float = 0.5
+    rate: float = 0.001
+    energy: float = 0.003
+    pose: float = 2.5e-7
+    tail: float = 1.0
+
+
+@dataclass(frozen=True)
+class JumpCfg:
+    """The jump mode.
+
+    Attributes:
+        mppi: the sampler's settings.
+        cost: what its rollouts are judged by; the target is always the handstand.
+        spacing: control steps between the points of the guess.
+        guess: points (front thigh, front calf, rear thigh, rear calf) [rad] that the plan starts from,
+            written by tools/jump_guess.py; empty: hold the last input.
+        asymmetry: noise of single joints relative to that of left-right symmetric motion.
+        hip: noise of the hip joints relative to the others.
+    """
+
+    mppi: MppiCfg = field(default_factory=MppiCfg)
+    cost: CostCfg = field(default_factory=CostCfg)
+    spacing: int = 8
+    guess: tuple[tuple[float, ...], ...] = ()
+    asymmetry: float = 0.2
+    hip: float = 0.3
+
+
+@dataclass(frozen=True)
+class FlipCfg:
+    """The flip task.
+
+    Attributes:
+        horizon: planner's horizon, control steps.
+        command: control step at which the target changes from the foot stand to the handstand.
+        cost: weights of the planner's cost.
+        jump: the jump mode.
+        foot: policy file of the foot stand; empty for the one that comes with the package.
+        hand: policy file of the handstand, likewise.
+        substeps: physics steps a control step.
+    """
+
+    horizon: int = 75
+    command: int = 75
+    cost: CostCfg = field(default_factory=CostCfg)
+    jump: JumpCfg = field(default_factory=JumpCfg)
+    foot: str = ""
+    hand: str = ""
+    substeps: int = 4
+
+
+def timeline(command: int) -> Callable[[Tensor], Tensor]:
+    """Whether the target is the handstand at control step k (n,), else the foot stand."""
+    return lambda k: k >= command
+
+
+def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
+    """Table I with a target stance that depends on the control step: `hand(k)` (n,) bool."""
+
+    def select(k: Tensor, foot: Tensor, handstand: Tensor) -> Tensor:
+        return torch.where(hand(k)[:, None], handstand, foot)
+
+    def height(x: Tensor, *_: Tensor) -> Tensor:
+        return cfg.height * (go2.STANCE_HEIGHT - x[:, 2]).square()
+
+    def orientation(x: Tensor, k: Tensor) -> Tensor:
+        gravity = -go2.rotation(x[:, 3:7])[:, 2, :2]
+        target = select(k, _gravity_xy(FOOTSTAND, x), _gravity_xy(HANDSTAND, x))
+        return cfg.orientation * (gravity - target).square().sum(1)
+
+    def joints(x: Tensor, k: Tensor) -> Tensor:
+        target = select(k, FOOTSTAND.pose.to(x), HANDSTAND.pose.to(x))
+        return cfg.joints * (x[:, 7:19] - target).square().sum(1)
+
+    def rate(x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
+        return cfg.rate * (u - u_prev).square().sum(1)
+
+    def energy(x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
+        power = x[:, 25:37] * go2.motor_torque(x[:, 7:19], x[:, 25:37], u)
+        return cfg.energy * power.norm(dim=1)
+
+    def pose(x: Tensor, *_: Tensor) -> Tensor:
+        return cfg.pose * torch.exp(-(x[:, 7:19] - go2.HOME.to(x)).square().sum(1))
+
+    def tail(x: Tensor, k: Tensor) -> Tensor:
+        return cfg.tail * (height(x) + orientation(x, k) + joints(x, k))
+
+    stage = {
+        "height": height,
+        "orientation": lambda x, u, u_prev, k: orientation(x, k),
+        "joints": lambda x, u, u_prev, k: joints(x, k),
+        "rate": rate,
+        "energy": energy,
+        "pose": pose,
+    }
+    return Cost(stage, {"tail": tail}, nonnegative=True)
+
+
+def _gravity_xy(stance: Stance, x: Tensor) -> Tensor:
+    return x.new_tensor([float(stance.sign), 0.0])
+
+
+def policy_path(name: str, given: str = "") -> Path:
+    """The policy file of a stance: the given one, else the one that comes with the package."""
+    return Path(given) if given else Path(str(resources.files("hmc.go2") / "policies" / f"{name}.onnx"))
+
+
+def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Mppi:
+    """The jump: MPPI towards the handstand, its noise mostly left-right symmetric."""
+    symmetric = torch.zeros(4, 12)
+    for row, joint in enumerate((1, 2, 7, 8)):
+        symmetric[row, [joint, joint + 3]] = 1.0
+    single = cfg.asymmetry * torch.diag(torch.tensor([cfg.hip, 1.0, 1.0] * 4))
+    guess = None
+    if cfg.guess:
+        points = torch.tensor(cfg.guess, dtype=torch.float64)
+        at = torch.arange(cfg.spacing * (len(points) - 1) + 1) / cfg.spacing
+        low = at.floor().long().clamp(max=len(points) - 2)
+        dense = points[low] + (at - low)[:, None] * (points[low + 1] - points[low])
+        hip = torch.zeros(len(dense), 1, dtype=dense.dtype)
+        guess = torch.cat([hip, dense[:, :2], hip, dense[:, :2], hip, dense[:, 2:], hip, dense[:, 2:]], 1)
+    return Mppi(
+        "jump",
+        cfg.mppi,
+        make_sim,
+        stance_cost(cfg.cost, lambda k: torch.ones_like(k, dtype=torch.bool)),
+        go2.Q_LOWER.double(),
+        go2.Q_UPPER.double(),
+        guess=guess,
+        basis=torch.cat([symmetric, single]).double(),
+        seed=seed,
+    )
+
+
+def make_sim(num_worlds: int, substeps: int = 4, threads: int = 0) -> Sim:
+    """Worlds of the Go2 on the C engine."""
+    return MujocoSim(go2.load_model(), num_worlds, substeps=substeps, threads=threads)
+
+
+def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
+    """The flip with modes foot, jump and hand.
+
+    Args:
+        cfg: settings.
+        seed: of the jump's noise.
+        threads: of the engine; 0 for all cores.
+    """
+    sim = partial(make_sim, substeps=cfg.substeps, threads=threads)
+    modes = ModeSet(
+        [
+            Policy(policy_path("footstand", cfg.foot), name="foot"),
+            jump_mode(cfg.jump, sim, seed),
+            Policy(policy_path("handstand", cfg.hand), name="hand"),
+        ]
+    )
+    return Task("flip", modes, stance_cost(cfg.cost, timeline(cfg.command)), cfg.horizon, sim)

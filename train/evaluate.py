@@ -1,0 +1,129 @@
+"""Measure a policy: `python train/evaluate.py POLICY.onnx --starts stance`."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import torch  # noqa: E402
+import tyro  # noqa: E402
+from torch import Tensor  # noqa: E402
+
+from hmc.go2.model import load_model  # noqa: E402
+from hmc.go2.policy import Policy  # noqa: E402
+from hmc.go2.stances import STANCES, Stance  # noqa: E402
+from hmc.sim.base import Sim  # noqa: E402
+from hmc.sim.mujoco import MujocoSim  # noqa: E402
+from train.starts import Starts, StartsCfg  # noqa: E402
+
+# name -> (time to reach the stance, time to hold it from then on) [s]
+PROTOCOLS = {"stance": (0.5, 9.5), "home": (3.0, 5.0), "recorded": (3.0, 5.0)}
+
+
+@dataclass(frozen=True)
+class Score:
+    """Successes of a number of episodes, with the 95 % Wilson interval of the rate."""
+
+    success: int
+    episodes: int
+
+    @property
+    def rate(self) -> float:
+        """Share of episodes that succeeded."""
+        return self.success / self.episodes
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval (Wilson 1927)."""
+        n, p, z = self.episodes, self.rate, 1.959964
+        middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+        return middle - half, middle + half
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.success} of {self.episodes} ({self.rate:.1%}; 95 % interval {low:.1%} to {high:.1%})"
+
+
+def held_over_time(sim: Sim, policy: Policy, stance: Stance, x: Tensor, u: Tensor, steps: int) -> Tensor:
+    """Whether the stance is held after each step under the policy, (steps, n) bool."""
+    sim.reset(x, u)
+    k = torch.zeros(len(x), dtype=torch.long)
+    memory = policy.reset(sim.x(), sim.u(), k)
+    held = []
+    for step in range(steps):
+        action, memory = policy.act(sim.x(), sim.u(), memory, k + step)
+        sim.step(action)
+        held.append(stance.held(sim.x()))
+    return torch.stack(held)
+
+
+def reached_and_kept(held: Tensor, reach: int, keep: int) -> Tensor:
+    """Episodes (steps, n) in which `keep` steps in a row are held, beginning within `reach` steps, (n,)."""
+    run = torch.zeros(held.shape[1], dtype=torch.long)
+    good = torch.zeros(held.shape[1], dtype=torch.bool)
+    for step, now in enumerate(held):
+        run = torch.where(now, run + 1, torch.zeros_like(run))
+        good |= (run >= keep) & (step + 1 - keep <= reach)
+    return good
+
+
+@torch.no_grad()
+def score(policy: Policy, starts: Starts, protocol: str, episodes: int, threads: int) -> Score:
+    """Successes of `episodes` under one of PROTOCOLS."""
+    start = starts.sample(episodes)
+    sim = MujocoSim(load_model(), episodes, threads=threads)
+    reach, keep = (round(seconds / sim.dt) for seconds in PROTOCOLS[protocol])
+    held = held_over_time(sim, policy, starts.stance, start.x, start.u, reach + keep)
+    return Score(int(reached_and_kept(held, reach, keep).sum()), episodes)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line.
+
+    Attributes:
+        policy: ONNX file.
+        starts: stance: the disturbed stance, to be held for 10 s; home: the four-legged stand, stance
+            reached within 3 s and held 5 s; recorded: states of --records, likewise.
+        episodes: number of episodes.
+        seed: of the starts.
+        records: file of recorded states, as tools/record_flips.py writes it.
+        threads: of the engine; 0 for all cores.
+        json: also write the result here.
+    """
+
+    policy: tyro.conf.Positional[Path]
+    starts: Literal["stance", "home", "recorded"] = "stance"
+    episodes: int = 500
+    seed: int = 1000
+    records: Path | None = None
+    threads: int = 0
+    json: Path | None = None
+
+
+def main(args: Args) -> None:
+    """Measure and print."""
+    torch.manual_seed(args.seed)
+    policy = Policy(args.policy)
+    shares = {"stance": 0.0, "way": 0.0, "home": 0.0, "recorded": 0.0, args.starts: 1.0}
+    cfg = StartsCfg(**shares, records=str(args.records or ""))
+    starts = Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
+    result = score(policy, starts, args.starts, args.episodes, args.threads)
+    reach, keep = PROTOCOLS[args.starts]
+    print(f"{policy.metadata['mode']} from {args.starts}: within {reach} s and held {keep} s: {result}")
+    if args.json is not None:
+        low, high = result.interval
+        data = {"success": result.success, "episodes": result.episodes, "low": low, "high": high}
+        args.json.write_text(json.dumps(data) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
