@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hmc.schedule import SwitchSpace as SwitchSpace
     from hmc.sim.base import Sim as Sim
     from hmc.start import Start as Start
+    from hmc.start import make_start as make_start
     from hmc.task import Task as Task
     from hmc.trace import Trace as Trace
 
@@ -41,6 +42,7 @@ _HOME = {
     "SwitchSpace": "hmc.schedule",
     "Sim": "hmc.sim.base",
     "Start": "hmc.start",
+    "make_start": "hmc.start",
     "Task": "hmc.task",
     "Trace": "hmc.trace",
 }

@@ -40,7 +40,7 @@ class Meter:
     budget: Budget
     evaluator: Evaluator
     draws: int = 0
-    began: float = field(default_factory=time.perf_counter)
+    began: float = field(default_factory=lambda: time.perf_counter())
 
     @property
     def elapsed(self) -> float:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from hmc.planner import Plan, plan
+from hmc.budget import Budget
+from hmc.planner import Plan, Progress, plan
 from hmc.sim.base import Sim
 from hmc.start import Vector, make_start
 from hmc.task import Task
@@ -50,7 +51,7 @@ class Receding:
         seed: of the draws; each tick draws from (seed, k).
         k: control step of the first tick.
         sim: simulator to plan in; made once if left out.
-        options: the rest goes to `plan`: solver, samples, iterations, budget, tolerance, progress.
+        solver, samples, iterations, budget, tolerance, progress: as in `plan`, for every tick.
     """
 
     def __init__(
@@ -61,14 +62,29 @@ class Receding:
         seed: int = 0,
         k: int = 0,
         sim: Sim | None = None,
-        **options: Any,
+        solver: str = "sample",
+        samples: int = 64,
+        iterations: int | None = None,
+        budget: Budget | None = None,
+        tolerance: float = 1e-6,
+        progress: Progress | None = None,
     ):
         self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
-        self.sim = sim if sim is not None else task.make_sim(options.get("samples", 64))
+        self.sim = sim if sim is not None else task.make_sim(samples)
         self.mode: int | None = None
         self.memory: Tensor | None = None
         self.u: Tensor | None = None
-        self._options = options
+        self._plan = partial(
+            plan,
+            task,
+            sim=self.sim,
+            solver=solver,
+            samples=samples,
+            iterations=iterations,
+            budget=budget,
+            tolerance=tolerance,
+            progress=progress,
+        )
 
     @torch.no_grad()
     def tick(self, x: Vector, u: Vector | None = None, snapshot: Tensor | None = None) -> Tick:
@@ -79,24 +95,9 @@ class Receding:
             u: input applied last, (nu,), if it is not the one that the last tick gave.
             snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
         """
-        start = make_start(
-            self.task,
-            self.sim,
-            x,
-            self.u if u is None else u,
-            self.mode,
-            self.memory,
-            self.k,
-            snapshot,
-        )
-        result = plan(
-            self.task,
-            start,
-            schedule=self.schedule,
-            seed=(self.seed, self.k),
-            sim=self.sim,
-            **self._options,
-        )
+        last = self.u if u is None else u
+        start = make_start(self.task, self.sim, x, last, self.mode, self.memory, self.k, snapshot)
+        result = self._plan(start, schedule=self.schedule, seed=(self.seed, self.k))
         action = self._run(result.schedule[0], start.x, start.u)
         self.schedule = result.schedule.shift()
         self.k += 1

@@ -126,7 +126,8 @@ def run(search: Search, solve: Callable[[Search], None], iterations: float) -> N
             search.stopped_by = "iterations"
             return
         solve(search)
-        if search.accept():
-            search.tell()
-        elif search.stopped_by is None:
+        accepted = search.accept()
+        if search.stopped_by is None and not accepted:
             search.stopped_by = "converged"
+        elif search.stopped_by is None:
+            search.tell()

@@ -8,12 +8,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toy import Bad, Damp, Push, Ramp, ToySim, all_schedules, slow_cost, toy_task
 
 from hmc.cost import Cost
 from hmc.evaluate import Evaluator
 from hmc.schedule import Schedule
 from hmc.start import make_start
+from tests.toy import Bad, Damp, Push, Ramp, ToySim, all_schedules, slow_cost, toy_task
 
 X = [0.4, -0.2]
 
@@ -28,6 +28,8 @@ def test_cost_by_hand():
     """v += 0.1 u, p += 0.1 v from rest, all sin terms left out: J and its terms on paper."""
 
     class Glider(ToySim):
+        dt = 0.1
+
         def step(self, u, ids=None):
             p, v, _, h = self.save(ids).unbind(1)
             v = v + 0.1 * u[:, 0]
@@ -116,12 +118,13 @@ def test_a_bad_action_costs_inf_and_disturbs_nobody(value):
 
 def test_a_diverged_world_is_not_stepped_any_more():
     task = toy_task(6, [Push(0.0), Push(50.0)], blow_up=1.5)
-    task_evaluator = evaluator(task, num_worlds=4)
+    sim = ToySim(4, blow_up=1.5)
+    task_evaluator = Evaluator(task, sim, make_start(task, sim, X))
     rows = torch.tensor([[0] * 6, [1] * 6, [0, 1, 1, 1, 1, 1]])
     costs = task_evaluator.costs(rows)
     assert costs.isinf().tolist() == [False, True, True]
     assert task_evaluator.diverged == 2
-    steps = [sum(world in ids for ids in task_evaluator.sim.stepped) for world in range(3)]
+    steps = [sum(world in ids for ids in sim.stepped) for world in range(3)]
     assert steps[0] == 6
     assert steps[1] < steps[2] < 6, "each until its state stops being finite"
     assert task_evaluator.control_steps == sum(steps)
@@ -133,11 +136,18 @@ def test_a_bad_cost_is_a_diverged_world(where):
     def spoilt(x, *rest):
         return torch.where(x[:, 0] > 0.5, math.nan, x[:, 0])
 
-    terms = {"stage": {"a": lambda x, u, u_prev, k: x[:, 0] ** 2}, "terminal": {"b": lambda x, k: x[:, 1]}}
-    terms[where]["spoilt"] = spoilt
-    rolled = evaluator(toy_task(6, [Push(-1.0), Push(5.0)], Cost(**terms)))
+    stage = {"a": lambda x, u, u_prev, k: x[:, 0] ** 2, **({"s": spoilt} if where == "stage" else {})}
+    terminal = {"b": lambda x, k: x[:, 1], **({"t": spoilt} if where == "terminal" else {})}
+    rolled = evaluator(toy_task(6, [Push(-1.0), Push(5.0)], Cost(stage, terminal)))
     assert rolled.costs(torch.tensor([[0] * 6, [1] * 6])).isinf().tolist() == [False, True]
     assert rolled.diverged == 1
+
+
+def test_an_overflowing_cost_is_diverged_not_pruned():
+    stage = {"a": lambda x, u, u_prev, k: torch.where(u[:, 0] > 2, math.inf, 1.0)}
+    rolled = evaluator(toy_task(6, [Push(0.0), Push(5.0)], Cost(stage, nonnegative=True)))
+    assert rolled.costs(torch.tensor([[0] * 6, [1] * 6]), bound=100.0).isinf().tolist() == [False, True]
+    assert (rolled.diverged, rolled.pruned) == (1, 0)
 
 
 @settings(max_examples=60)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tracemalloc
 from collections import Counter
 from dataclasses import FrozenInstanceError
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def test_prints_as_runs():
 def test_runs_rebuild_the_schedule(items):
     schedule = Schedule(tuple(items))
     runs = schedule.runs()
-    assert all(a.stop == b.start and a.mode != b.mode for a, b in zip(runs, runs[1:], strict=False))
+    assert all(a.stop == b.start and a.mode != b.mode for a, b in pairwise(runs))
     rebuilt = Schedule.constant(0, len(items))
     for run in runs:
         rebuilt = rebuilt.stitch(run)
@@ -58,7 +59,7 @@ def test_is_a_value():
     assert Schedule(torch.tensor([2, 0])).modes == (2, 0)
     assert torch.equal(batch([a, Schedule((1, 2))]), torch.tensor([[0, 1], [1, 2]]))
     with pytest.raises(FrozenInstanceError):
-        a.modes = (1, 1)
+        setattr(a, "modes", (1, 1))  # noqa: B010
 
 
 @pytest.mark.parametrize(

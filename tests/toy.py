@@ -20,7 +20,7 @@ class ToySim:
     with strength `hidden`. Everything is elementwise, hence the same in a batch of any size.
     """
 
-    nx, nu, dt = 2, 1, 0.1
+    nx, nu, dt = 2, 1, 0.5
     device, dtype = torch.device("cpu"), torch.float64
 
     def __init__(self, num_worlds: int, hidden: float = 0.0, blow_up: float = math.inf):
@@ -109,11 +109,11 @@ class Bad(Mode):
 
 COST = Cost(
     stage={
-        "position": lambda x, u, u_prev, k: (x[:, 0] - torch.cos(0.2 * k.to(x.dtype))) ** 2,
+        "position": lambda x, u, u_prev, k: (x[:, 0] - torch.cos(0.9 * k.to(x.dtype))) ** 2,
         "velocity": lambda x, u, u_prev, k: 0.1 * x[:, 1] ** 2,
-        "rate": lambda x, u, u_prev, k: 0.05 * (u - u_prev)[:, 0] ** 2,
+        "rate": lambda x, u, u_prev, k: 0.02 * (u - u_prev)[:, 0] ** 2,
     },
-    terminal={"arrival": lambda x, k: 2.0 * x[:, 0] ** 2 + 0.01 * k.to(x.dtype)},
+    terminal={"arrival": lambda x, k: 0.5 * x[:, 0] ** 2 + 0.01 * k.to(x.dtype)},
     nonnegative=True,
 )
 

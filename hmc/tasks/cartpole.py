@@ -69,7 +69,7 @@ def cartpole(cfg: CartpoleCfg | None = None) -> Task:
     levels = torch.linspace(-1.0, 1.0, cfg.num_modes, dtype=torch.float64).tolist()
     return Task(
         name="cartpole",
-        modes=ModeSet([ConstantInput(f"{cfg.params.gear * level:+.3g}N", level) for level in levels]),
+        modes=ModeSet([ConstantInput(f"{cfg.params.gear * level:.3g} N", level) for level in levels]),
         cost=Cost(
             stage={
                 "angle": lambda x, u, u_prev, k: cfg.weight_angle * (x[:, 0].cos() - 1) ** 2,

@@ -1,0 +1,304 @@
+"""`plan`: solvers, budgets, certificates, interruption and refusals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hmc
+from hmc import Budget, Plan, PlanInterrupted, Schedule, plan
+from tests.toy import Bad, Damp, Push, Ramp, ToySim, slow_cost, toy_task
+
+X = [0.4, -0.2]
+FAR = [1.5, 1.0]
+
+
+@given(
+    x=st.tuples(st.floats(-2, 2), st.floats(-2, 2)),
+    incumbent=st.lists(st.integers(0, 2), min_size=5, max_size=5),
+    solver=st.sampled_from(["sample", "exhaustive"]),
+    samples=st.integers(4, 60),
+    draws=st.none() | st.integers(1, 80),
+    seed=st.integers(0, 9),
+)
+@settings(max_examples=40)
+def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed):
+    task = toy_task(5)
+    result = plan(
+        task, x, schedule=incumbent, solver=solver, samples=samples, budget=Budget(draws=draws), seed=seed
+    )
+    assert result.incumbent.modes == tuple(incumbent)
+    assert result.incumbent_cost == slow_cost(task, incumbent, x)
+    assert result.cost == slow_cost(task, result.schedule, x)
+    assert sum(result.terms.values()) == pytest.approx(result.cost, rel=1e-12)
+    assert tuple(result.terms) == task.cost.names
+    stitched = result.incumbent
+    for switch in result.switches:
+        stitched = stitched.stitch(switch)
+    assert stitched == result.schedule
+    assert len(result.costs) == len(result.switches) + 1
+    assert result.space_size == 45
+    assert result.draws >= result.rollouts - 1
+    assert result.stopped_by == ("converged" if result.locally_optimal else "draws")
+    assert not result.machine_dependent
+    assert result.draws <= (draws or math.inf)
+    assert result.coverage == result.seen / 45
+
+
+@pytest.mark.parametrize("solver", ["sample", "exhaustive"])
+@pytest.mark.parametrize("num_worlds", [1, 3, 200])
+def test_same_seed_same_plan_at_any_chunk_size(solver, num_worlds):
+    task = toy_task(8)
+    options = {"solver": solver, "samples": 32, "seed": 5, "budget": Budget(control_steps=2500)}
+    assert plan(task, FAR, sim=task.make_sim(num_worlds), **options) == plan(task, FAR, **options)
+
+
+def test_seeds_draw_differently():
+    plans = [plan(toy_task(8), FAR, samples=4, iterations=1, seed=seed) for seed in range(4)]
+    assert len({p.switches for p in plans}) > 1
+
+
+def test_sample_takes_the_first_improving_draw():
+    """With one draw a batch, Algorithm 2 stops at the same switch."""
+    for seed in range(5):
+        many = plan(toy_task(6), FAR, samples=63, iterations=1, seed=seed)
+        single = plan(toy_task(6), FAR, samples=1, iterations=1, seed=seed)
+        assert many.switches == single.switches
+        assert many.cost == single.cost < many.incumbent_cost
+
+
+def test_exhaustive_takes_the_best_of_all():
+    task = toy_task(5)
+    base = Schedule.constant(0, 5)
+    space = hmc.SwitchSpace(3, 5)
+    costs = [slow_cost(task, base.stitch(space[i]), FAR) for i in range(len(space))]
+    result = plan(task, FAR, solver="exhaustive", iterations=1, samples=7)
+    assert result.cost == min(costs)
+    assert result.switches == (space[costs.index(min(costs))],)
+    assert result.draws == len(space)
+
+
+def test_repeats_are_drawn_but_not_rolled_out():
+    result = plan(toy_task(6, [Push(1.0)]), X, solver="exhaustive")
+    assert (result.draws, result.rollouts, result.control_steps) == (21, 1, 6)
+    assert result.locally_optimal
+
+
+def test_a_no_op_switch_is_never_accepted():
+    result = plan(toy_task(6), FAR, tolerance=0.0)
+    assert result.locally_optimal
+    assert all(after < before for before, after in pairwise(result.costs))
+
+
+def test_tolerance_is_relative():
+    result = plan(toy_task(6), FAR, tolerance=0.2)
+    steps = list(pairwise(result.costs))
+    assert steps
+    assert all(after < 0.8 * before for before, after in steps)
+    assert result.cost > plan(toy_task(6), FAR).cost
+
+
+@pytest.mark.parametrize("solver", ["sample", "exhaustive"])
+@pytest.mark.parametrize("draws", [1, 10, 57])
+def test_a_draw_budget_is_kept(solver, draws):
+    result = plan(toy_task(8), FAR, solver=solver, samples=16, budget=Budget(draws=draws))
+    assert result.draws == draws
+    assert result.stopped_by == "draws"
+    assert not result.locally_optimal
+    assert result.cost <= result.incumbent_cost
+
+
+@pytest.mark.parametrize("solver", ["sample", "exhaustive"])
+@pytest.mark.parametrize("steps", [8, 9, 100, 333])
+def test_a_control_step_budget_is_never_exceeded(solver, steps):
+    result = plan(toy_task(8), FAR, solver=solver, budget=Budget(control_steps=steps))
+    assert 8 <= result.control_steps <= steps
+    assert result.stopped_by == "control_steps"
+    if steps >= 100:
+        assert result.control_steps > steps - 16, "what fits is used"
+        assert result.cost < result.incumbent_cost
+
+
+def test_a_budget_that_reaches_all_of_omega_converges():
+    task = toy_task(4)
+    best = plan(task, FAR)
+    again = plan(task, FAR, schedule=best.schedule, budget=Budget(draws=30))
+    assert (again.stopped_by, again.draws, again.coverage) == ("converged", 30, 1.0)
+
+
+def test_coverage_counts_since_the_last_accepted_switch():
+    best = plan(toy_task(6), FAR).schedule
+    result = plan(toy_task(6), FAR, schedule=best, samples=10, budget=Budget(draws=21))
+    assert result.coverage == 21 / 63
+    accepted = plan(toy_task(6), FAR, iterations=1)
+    assert (accepted.stopped_by, accepted.coverage) == ("iterations", 0.0)
+
+
+def test_wall_clock_budget_stops_in_mid_batch_and_says_so(monkeypatch):
+    clock = iter(range(10_000))
+    monkeypatch.setattr("hmc.budget.time.perf_counter", lambda: float(next(clock)))
+    task = toy_task(8)
+    result = plan(task, FAR, samples=200, budget=Budget(seconds=30), sim=task.make_sim(16))
+    assert result.stopped_by == "seconds"
+    assert result.machine_dependent
+    assert "another speed" in str(result)
+    assert 0 < result.draws < 100, "two or three chunks of 16 worlds x 8 steps"
+    assert result.cost < result.incumbent_cost
+    assert result.control_steps < 8 + 30 * 16
+
+
+def test_no_time_gives_back_the_incumbent():
+    result = plan(toy_task(6), FAR, schedule=[0, 1, 2, 0, 1, 2], budget=Budget(seconds=1e-9))
+    assert result.schedule.modes == (0, 1, 2, 0, 1, 2)
+    assert (result.draws, result.rollouts, result.coverage) == (0, 1, 0.0)
+
+
+@pytest.mark.parametrize("calls", [1, 2, 5])
+@pytest.mark.parametrize("solver", ["sample", "exhaustive"])
+def test_progress_sees_every_step_and_can_stop(solver, calls):
+    seen: list[Plan] = []
+
+    def watch(so_far: Plan) -> bool:
+        seen.append(so_far)
+        return len(seen) < calls
+
+    result = plan(toy_task(8), FAR, solver=solver, samples=20, progress=watch)
+    assert len(seen) == calls
+    assert result.stopped_by == "progress"
+    assert result.cost <= seen[-1].cost <= seen[0].cost <= result.incumbent_cost
+    assert all(so_far.stopped_by == "" for so_far in seen[:-1])
+
+
+def test_progress_does_not_change_the_plan():
+    watched = plan(toy_task(8), FAR, samples=20, progress=lambda so_far: None)
+    assert watched == plan(toy_task(8), FAR, samples=20)
+
+
+@pytest.mark.parametrize("solver", ["sample", "exhaustive"])
+@pytest.mark.parametrize("step", [7, 20, 45, 60])
+def test_ctrl_c_carries_the_best_plan_so_far(solver, step):
+    class Interrupted(ToySim):
+        def step(self, u, ids=None):
+            super().step(u, ids)
+            if len(self.stepped) == step:
+                raise KeyboardInterrupt
+
+    task = replace(toy_task(6), make_sim=Interrupted)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        plan(task, FAR, solver=solver, samples=8)
+    assert isinstance(caught.value, PlanInterrupted)
+    best = caught.value.plan
+    assert best.stopped_by == "interrupt"
+    assert best.cost == slow_cost(task, best.schedule, FAR) <= best.incumbent_cost
+    if step == 60:
+        assert best.cost < best.incumbent_cost
+
+
+def test_diverged_schedules_are_counted_and_left_alone():
+    task = toy_task(6, [Push(0.5), Bad(after=0), Damp()])
+    result = plan(task, FAR)
+    assert result.diverged > 0
+    assert 1 not in result.schedule.modes
+    assert "rollouts diverged" in str(result)
+    clean = plan(toy_task(6, [Push(0.5), Push(0.5, "same"), Damp()]), FAR, solver="exhaustive")
+    assert plan(task, FAR, solver="exhaustive").cost == clean.cost
+
+
+def test_out_of_a_diverging_incumbent():
+    result = plan(toy_task(6, [Bad(after=2), Damp()]), FAR)
+    assert result.incumbent_cost == math.inf
+    assert math.isfinite(result.cost)
+    hopeless = plan(toy_task(6, [Bad(after=2)]), FAR)
+    assert hopeless.cost == math.inf
+    assert hopeless.diverged == 1
+
+
+def test_default_incumbent():
+    assert plan(toy_task(6), X, iterations=0).schedule.modes == (0,) * 6
+    assert plan(toy_task(6), X, mode="damp", iterations=0).schedule.modes == (1,) * 6
+    assert plan(toy_task(6), X, mode=2, iterations=0).schedule.modes == (2,) * 6
+    named = ["push1", "damp", "ramp", "ramp", "damp", "push1"]
+    result = plan(toy_task(6), X, schedule=named, iterations=0)
+    assert result.schedule.modes == (0, 1, 2, 2, 1, 0)
+    assert str(result.schedule) == "push1 x1 | damp x1 | ramp x2 | damp x1 | push1 x1"
+
+
+def test_planning_from_a_running_mode():
+    memory, modes = [3.0, 0.9, -0.4, 4.0], (2, 2, 2, 2, 2, 2)
+    result = plan(
+        toy_task(6), X, u=[0.3], mode="ramp", memory=memory, k=7, schedule=modes, solver="exhaustive"
+    )
+    running = {"u": [0.3], "mode": 2, "memory": memory, "k": 7}
+    assert result.incumbent_cost == slow_cost(toy_task(6), modes, X, **running)
+    assert result.cost == slow_cost(toy_task(6), result.schedule, X, **running)
+    assert result.incumbent_cost != slow_cost(toy_task(6), modes, X, u=[0.3], k=7)
+
+
+BAD = {
+    "short state": ({"x": [0.1]}, ValueError, r"task 'toy': state x: expected 2 numbers.*got shape \(1,\)"),
+    "batched state": ({"x": [[0.1, 0.2]]}, ValueError, r"got shape \(1, 2\)"),
+    "NaN state": ({"x": [0.1, math.nan]}, ValueError, "state x: expected finite numbers, got nan at index 1"),
+    "infinite state": ({"x": [-math.inf, 0.0]}, ValueError, "got -inf at index 0"),
+    "NaN input": ({"u": [math.nan]}, ValueError, "last input u: expected finite numbers"),
+    "long input": ({"u": [0.1, 0.2]}, ValueError, "last input u: expected 1 numbers"),
+    "unknown mode": ({"mode": "rmap"}, KeyError, "unknown mode 'rmap': .*push1, damp, ramp; did you"),
+    "mode out of range": ({"mode": 3}, KeyError, "unknown mode 3: this set has push1, damp, ramp"),
+    "unknown mode in schedule": ({"schedule": [0, 1, 2, 0, 1, "dump"]}, KeyError, "did you mean 'damp'"),
+    "negative mode": ({"schedule": [0, 1, 2, 0, 1, -1]}, KeyError, "unknown mode -1"),
+    "short schedule": ({"schedule": [0]}, ValueError, "has 1 steps, expected the horizon, 6"),
+    "unknown solver": (
+        {"solver": "samples"},
+        ValueError,
+        "unknown solver 'samples': expected one of sample, .*did",
+    ),
+    "no samples": ({"samples": 0}, ValueError, "samples must be at least 1"),
+    "iterations": ({"iterations": -1}, ValueError, "iterations must be >= 0"),
+    "tolerance": ({"tolerance": math.nan}, ValueError, "tolerance must be a finite share"),
+    "step": ({"k": -1}, ValueError, "control step k must be >= 0"),
+    "memory alone": ({"memory": [0.0] * 4}, ValueError, "memory was given without the mode"),
+    "memory size": ({"mode": "ramp", "memory": [0.0]}, ValueError, "memory of mode 'ramp': expected 4"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    changed, error, message = BAD[case]
+    with pytest.raises(error, match=message):
+        plan(toy_task(6), **{"x": X, **changed})
+
+
+@pytest.mark.parametrize("limit", ["draws", "control_steps", "seconds"])
+@pytest.mark.parametrize("value", [0, -1, math.nan])
+def test_a_budget_of_nothing_is_refused(limit, value):
+    with pytest.raises(ValueError, match=f"budget {limit} must be more than 0"):
+        Budget(**{limit: value})
+
+
+def test_a_start_comes_with_all_it_needs():
+    task = toy_task(6)
+    whole = hmc.Evaluator(task, task.make_sim(1), hmc.make_start(task, task.make_sim(1), X)).trace(
+        Schedule((2,) * 6)
+    )
+    start = whole.start(2)
+    assert plan(task, start, iterations=0).schedule.modes == (2,) * 6
+    with pytest.raises(ValueError, match="do not pass them as well"):
+        plan(task, start, k=2)
+
+
+def test_plan_prints_what_backs_it():
+    text = str(plan(toy_task(6, [Damp(), Ramp()]), FAR))
+    assert "locally optimal of 42 switches" in text
+    assert "control steps" in text
+    assert "stopped by converged" in text
+
+
+def test_arrays_and_tensors_are_fine_as_states():
+    wanted = plan(toy_task(6), FAR)
+    assert plan(toy_task(6), torch.tensor(FAR, dtype=torch.float64)) == wanted
+    assert plan(toy_task(6), torch.tensor(FAR, dtype=torch.float64).numpy()) == wanted
