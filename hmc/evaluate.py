@@ -65,7 +65,12 @@ class Evaluator:
             stop: asked before every control step; once it says True, what is not known yet comes back
                 as NaN.
         """
-        keys = _keys(schedules)
+        if schedules.numel() and not 0 <= int(schedules.min()) <= int(schedules.max()) < len(self.task.modes):
+            raise ValueError(
+                f"schedules hold modes {int(schedules.min())} to {int(schedules.max())}: task "
+                f"{self.task.name!r} has 0 to {len(self.task.modes) - 1}"
+            )
+        keys = self._keys(schedules)
         todo: dict[bytes, int] = {}
         for row, key in enumerate(keys):
             known = self._known.get(key)
@@ -88,7 +93,7 @@ class Evaluator:
         """Cost of one schedule, term by term; NaN where its world diverged."""
         rows = schedule.tensor()[None]
         self.costs(rows)
-        return dict(zip(self.task.cost.names, self._known[_keys(rows)[0]].terms or (), strict=True))
+        return dict(zip(self.task.cost.names, self._known[self._keys(rows)[0]].terms or (), strict=True))
 
     def trace(self, schedule: Schedule) -> Trace:
         """The trajectory of one schedule; its control steps are not counted."""
@@ -108,6 +113,6 @@ class Evaluator:
             return math.nan
         return math.inf if known.terms is None else known.cost
 
-
-def _keys(schedules: Tensor) -> list[bytes]:
-    return [row.tobytes() for row in schedules.to("cpu", torch.int32).numpy()]
+    def _keys(self, schedules: Tensor) -> list[bytes]:
+        small = torch.uint8 if len(self.task.modes) <= 256 else torch.int32
+        return [row.tobytes() for row in schedules.to("cpu", small).numpy()]

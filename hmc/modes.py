@@ -16,7 +16,8 @@ class Mode(ABC):
 
     A mode is a deterministic function of (x, u, memory, k): called again with the same arguments, in
     a batch of any size and order, it returns the same action. Random modes draw their noise from a
-    counter keyed by a seed and k. Proposition 1 of the paper rests on that.
+    counter keyed by a seed and k. Proposition 1 of the paper rests on that. Mind matrix products: torch
+    may round a network's output differently in a batch of another size; onnxruntime was seen not to.
 
     What a mode remembers between steps is one row of ``memory_size`` numbers a world. It belongs to
     the rolled-out state: it is saved, restored and branched with it, and made anew by `reset` exactly
@@ -25,6 +26,7 @@ class Mode(ABC):
 
     name: str
     memory_size: int = 0
+    control_steps: int = 0  # rolled out inside the mode so far: a planner counts them as its own
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
         """Memory at entry, (n, memory_size).

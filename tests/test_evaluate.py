@@ -200,6 +200,11 @@ def test_stopping_leaves_unknown_what_is_not_finished():
     assert torch.equal(rolled.costs(rows)[:2], costs[:2])
 
 
+def test_a_mode_that_is_not_there_is_named():
+    with pytest.raises(ValueError, match="modes 0 to 3: task 'toy' has 0 to 2"):
+        evaluator().costs(torch.tensor([[0, 1, 2, 3, 0, 0]]))
+
+
 def test_no_schedules_no_costs():
     assert evaluator().costs(torch.empty(0, 6, dtype=torch.long)).tolist() == []
 
