@@ -12,13 +12,15 @@ from hmc.evaluate import Evaluator
 class Budget:
     """Limits on one call of `plan`; None is no limit.
 
-    The incumbent is always rolled out, whatever the budget. Beyond that, draws and control steps are
-    never exceeded. A wall-clock budget is looked at before every control step; a batch that it cuts
-    short is dropped, and the result may then depend on the machine's speed.
+    The incumbent is always rolled out, whatever the budget. Beyond that, draws are never exceeded, nor
+    are control steps where modes make none of their own. What a sampling mode will roll out inside
+    itself is not known before; a batch is cut to what the rollouts before it took. A wall-clock budget is
+    looked at before every control step; a batch that it cuts short is dropped, and the result may then
+    depend on the machine's speed.
 
     Attributes:
         draws: switches drawn from Omega.
-        control_steps: control steps rolled out, over all worlds.
+        control_steps: control steps rolled out, over all worlds and inside the modes.
         seconds: wall-clock time [s].
     """
 
@@ -54,8 +56,9 @@ class Meter:
     def room(self, wanted: int) -> tuple[int, str]:
         """How many of `wanted` draws may be evaluated now, and which limit is the tightest.
 
-        Every draw is reckoned at its full T control steps: what pruning and repeats save is seen after
-        the batch, so that the same draws are made whatever the machine.
+        A draw is reckoned at its full T control steps, or at what a rollout took so far where modes roll
+        out inside themselves: what pruning and repeats save is seen after the batch, so that the same
+        draws are made whatever the machine.
         """
         if self.expired():
             return 0, "seconds"
@@ -63,6 +66,8 @@ class Meter:
         if self.budget.draws is not None:
             rooms.append((self.budget.draws - self.draws, "draws"))
         if self.budget.control_steps is not None:
-            left = self.budget.control_steps - self.evaluator.control_steps
-            rooms.append((max(0, left // self.evaluator.task.horizon), "control_steps"))
+            used = self.evaluator.control_steps
+            left = self.budget.control_steps - used
+            each = max(self.evaluator.task.horizon, used // max(1, self.evaluator.rollouts))
+            rooms.append((max(0, left // each), "control_steps"))
         return min(rooms)

@@ -141,7 +141,7 @@ def plan(
         k: control steps since the start of the task.
         snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
         schedule: the incumbent, T modes by index or name; by default `mode` (else mode 0) throughout.
-        solver: "sample" (Algorithms 1 and 2) takes the first switch drawn that improves; "exhaustive"
+        solver: "sample" (Algorithms 1 and 2) takes the best of the first batch that improves; "exhaustive"
             (Algorithm 1) evaluates all of Omega and takes the best.
         samples: N, switches drawn a batch.
         iterations: at most this many switches are accepted; None for as many as improve.

@@ -22,7 +22,7 @@ class Worlds:
     the mode that ran last in each world and its memory. Branching a rollout copies both.
 
     Attributes:
-        control_steps: control steps made so far, over all worlds.
+        control_steps: control steps made so far, over all worlds and inside the modes.
     """
 
     def __init__(self, task: Task, sim: Sim):
@@ -61,7 +61,9 @@ class Worlds:
             if rows is None:
                 continue
             size = mode.memory_size
+            nested = mode.control_steps
             chosen, after = mode.act(x[rows], u[rows], memory[rows, :size], k[rows])
+            self.control_steps += mode.control_steps - nested
             n = len(k[rows])
             action[rows] = _shaped(mode, "act() actions", chosen, (n, self.sim.nu)).to(u.dtype)
             if size > 0:

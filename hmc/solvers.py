@@ -102,10 +102,13 @@ class Search:
 
 
 def sample(search: Search) -> None:
-    """Algorithm 2: draw from Omega without replacement, take the first switch that improves."""
+    """Algorithm 2: draw from Omega without replacement until a batch has a switch that improves.
+
+    The batch's best is taken, not its first: the whole batch has been rolled out by then.
+    """
     for indices, costs in search.batches(Draws(len(search.space), search.rng)):
-        for i in (costs < search.bound).nonzero().flatten():
-            search.offer(indices[i], costs[i])
+        best = costs.argmin()
+        if search.offer(indices[best], costs[best]):
             return
 
 
