@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hmc.sim.check import check
+
 
 @dataclass(frozen=True)
 class CartpoleParams:
@@ -96,9 +98,11 @@ class CartpoleSim:
         return self.save(ids)[:, 5]
 
     def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+        check(self.num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
         self.load(torch.cat([x, u, torch.zeros_like(x[:, :1])], dim=1).to(self.dtype), ids)
 
     def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+        check(self.num_worlds, ids, u=(u, self.nu))
         row = self.save(ids)
         x, force = row[:, :4], self.params.gear * u[:, 0].to(self.dtype)
         h = self._dt / self._substeps
@@ -114,6 +118,7 @@ class CartpoleSim:
         return self._rows.clone() if ids is None else self._rows[ids]
 
     def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+        check(self.num_worlds, ids, rows=(rows, self._rows.shape[1]))
         self._rows[slice(None) if ids is None else ids] = rows
 
     def energy(self, ids: Tensor | None = None) -> Tensor:

@@ -7,6 +7,8 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
+from hmc.sim.check import check
+
 
 class MujocoSim:
     """W worlds of one MuJoCo model on `mujoco.batch.Batch`; see `hmc.sim.base.Sim`.
@@ -41,6 +43,7 @@ class MujocoSim:
         self._qpos = torch.from_numpy(self.batch.bind("qpos"))
         self._qvel = torch.from_numpy(self.batch.bind("qvel"))
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
+        self._force = self.batch.bind("actuator_force")  # filled by steps after the bind, so bind now
         self._fresh = self._row[0].clone()
 
     @property
@@ -76,6 +79,7 @@ class MujocoSim:
         return self._ctrl.clone() if ids is None else self._ctrl[ids]
 
     def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+        check(self.num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
         where = slice(None) if ids is None else ids
         self._row[where] = self._fresh
         self._qpos[where] = x[:, : self.model.nq].to(torch.float64)
@@ -83,22 +87,22 @@ class MujocoSim:
         self._ctrl[where] = u.to(torch.float64)
 
     def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+        check(self.num_worlds, ids, u=(u, self.nu))
         self._ctrl[slice(None) if ids is None else ids] = u.to(torch.float64)
-        self.batch.step(None if ids is None else ids.numpy(), nstep=self._substeps)
+        # the engine takes indices in ascending order only
+        self.batch.step(None if ids is None else ids.sort().values.numpy(), nstep=self._substeps)
 
     def save(self, ids: Tensor | None = None) -> Tensor:
         return self._row.clone() if ids is None else self._row[ids]
 
     def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+        check(self.num_worlds, ids, rows=(rows, self._row.shape[1]))
         self._row[slice(None) if ids is None else ids] = rows
 
     def actuator_force(self, ids: Tensor | None = None) -> Tensor:
         """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
-        force = torch.from_numpy(self.batch.bind("actuator_force"))
-        return force.clone() if ids is None else force[ids]
+        return torch.tensor(self._force if ids is None else self._force[ids.numpy()])
 
 
 def _quiet(message: str) -> None:
     del message
-
-

@@ -1,0 +1,89 @@
+"""Choosing an engine by name and device, with an error in one line for what is not there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from hmc.sim.base import Sim
+
+ENGINES = ("auto", "mujoco", "warp")
+
+
+def make_sim(
+    model: mujoco.MjModel,
+    num_worlds: int,
+    engine: str = "auto",
+    *,
+    device: str | torch.device | None = None,
+    substeps: int = 4,
+    threads: int = 0,
+) -> Sim:
+    """Worlds of a MuJoCo model on the engine asked for; see `hmc.sim.base.Sim`.
+
+    Args:
+        model: compiled model.
+        num_worlds: number of worlds W.
+        engine: "mujoco" (C, on the CPU), "warp" (MuJoCo Warp), or "auto": warp on a GPU, mujoco elsewhere.
+        device: where to simulate; left out, a GPU if there is one, unless the engine is "mujoco".
+        substeps: physics steps a control step.
+        threads: of the C engine; 0 for all cores.
+
+    Raises:
+        ValueError: an engine that is not known, a device that does not exist, or the two do not fit.
+    """
+    if engine not in ENGINES:
+        raise ValueError(f"unknown engine {engine!r}: choose one of {', '.join(ENGINES)}")
+    there = None if device is None else find_device(device)
+    if engine == "auto":
+        cuda = torch.cuda.is_available() if there is None else there.type == "cuda"
+        engine = "warp" if cuda else "mujoco"
+    if engine == "mujoco":
+        if there is not None and there.type != "cpu":
+            raise ValueError(
+                f"engine mujoco runs on the CPU, not on {device}: leave device out, or take warp"
+            )
+        from hmc.sim.mujoco import MujocoSim
+
+        return MujocoSim(model, num_worlds, substeps=substeps, threads=threads)
+    if there is None and not torch.cuda.is_available():
+        raise ValueError(
+            f"engine warp wants a GPU and {_devices()}: take engine mujoco, its fast CPU sibling"
+        )
+    try:
+        from hmc.sim.warp import WarpSim
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"engine warp needs {error.name}: pip install 'hmc[warp]', or take mujoco"
+        ) from error
+    return WarpSim(model, num_worlds, device=there or "cuda", substeps=substeps)
+
+
+def find_device(device: str | torch.device) -> torch.device:
+    """The torch device of a name, with its index; an error if this machine has no such device."""
+    try:
+        found = torch.device(device)
+    except RuntimeError:
+        raise ValueError(f"unknown device {str(device)!r}: name one like cpu or cuda:0") from None
+    if found.type == "cpu":
+        return torch.device("cpu")
+    if found.type != "cuda":
+        raise ValueError(f"engines run on cpu or cuda devices, not on {device}")
+    index = found.index or 0
+    if index >= torch.cuda.device_count():
+        raise ValueError(f"device {device} does not exist, {_devices()}: take one of these")
+    return torch.device("cuda", index)
+
+
+def _devices() -> str:
+    """What there is, in words."""
+    count = torch.cuda.device_count()
+    if count:
+        return "there are cpu, " + ", ".join(f"cuda:{i}" for i in range(count))
+    if torch.version.cuda is None:
+        return "there is only cpu (this torch is built without CUDA)"
+    return "there is only cpu (no GPU, or no NVIDIA driver)"
