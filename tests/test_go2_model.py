@@ -92,9 +92,9 @@ def ours() -> mujoco.MjModel:
 
 def inertia_tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
     """Inertia about the centre of mass, in the body's frame [kg m^2], (3, 3)."""
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.body(body).iquat)
-    turn = turn.reshape(3, 3)
+    flat = np.empty(9)
+    mujoco.mju_quat2Mat(flat, model.body(body).iquat)
+    turn = flat.reshape(3, 3)
     return turn @ np.diag(model.body(body).inertia) @ turn.T
 
 

@@ -71,7 +71,8 @@ def start(kind: str, model: mujoco.MjModel, n: int, rng: Generator) -> tuple[np.
     else:
         turn = rng.normal(size=(n, 4))
         q[:, 2], q[:, 3:7] = 0.7, turn / np.linalg.norm(turn, axis=1, keepdims=True)
-        q[:, 7:] = rng.uniform(*model.jnt_range[1:].T, (n, 12))
+        low, high = model.jnt_range[1:].T
+        q[:, 7:] = rng.uniform(low, high, (n, 12))
         v[:] = rng.normal(size=(n, 18)) * np.repeat([1.5, 4.0, 6.0], [3, 3, 12])
     return q, v
 
@@ -112,7 +113,8 @@ def play(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray, ctrl: np.ndarray) 
             depth = (radius - geom.reshape(len(q), -1, 3)[:, feet, 2]).max(1)
             rows.append((energy.sum(1), work, before, force.copy(), height, depth, over))
             work = work + (force * (before + qvel[:, 6:])).sum(1) / 2 * model.opt.timestep
-    return Play(*(np.stack(column) for column in zip(*rows, strict=True)), np.hstack([qpos, qvel]))
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    return Play(*columns, *[np.hstack([qpos, qvel])])
 
 
 @pytest.fixture(scope="module")
@@ -149,11 +151,11 @@ def test_energy_comes_from_the_actuators(plays, family):
 def test_contacts_give_back_only_what_they_took(plays, family):
     """Between any two moments, too, the gain is small: the springs of feet, trunk and joint stops.
 
-    Measured: up to 13 J, of about 50 J that a hard landing dissipates. A solver that is cut short
+    Measured: up to 5.6 J, of about 50 J that a hard landing dissipates. A solver that is cut short
     creates hundreds.
     """
     gain = gained(plays[family])
-    assert (gain - np.minimum.accumulate(gain, 0)).max() < 20.0
+    assert (gain - np.minimum.accumulate(gain, 0)).max() < 15.0
 
 
 def test_this_test_sees_an_unconverged_solver():
@@ -163,7 +165,7 @@ def test_this_test_sees_an_unconverged_solver():
     q, v = start("home", model, 20, rng)
     p = play(model, q, v, targets("hold", model, 20, rng))
     gain = gained(p)
-    assert not np.isfinite(p.state).all() or (gain - np.minimum.accumulate(gain, 0)).max() > 20.0
+    assert not np.isfinite(p.state).all() or (gain - np.minimum.accumulate(gain, 0)).max() > 15.0
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -182,40 +184,42 @@ def test_joint_speed(plays, family):
     """A motor never drives a joint above its published speed; a blow or one long substep can push it there.
 
     In one substep of 5 ms the calf motor's 38.7 N m can add 15 rad/s to a bare calf, past the no-load
-    speed, where the curve (test above) then brakes it. Measured: at most 2.5 times the published speed
-    (1.5 from standing starts), and 4.3 % of the time above it under bang-bang targets, 2 % otherwise.
+    speed, and a foot that hits the floor as much again; the curve (test above) then brakes it. Measured:
+    2.4 times the published speed for one substep (3.1 when thrown), 1.4 times or less in 9,999 of 10,000
+    samples, and 4.5 % of the time above it under bang-bang targets, 2 % otherwise.
     """
     speed = np.abs(plays[family].speed) / SPEED
-    assert speed.max() < (3.0 if family == "thrown" else 1.8)
+    assert speed.max() < (4.5 if family == "thrown" else 3.0)
+    assert np.quantile(speed, 0.9999) < 1.6
     assert (speed > 1.0).mean() < 0.06
 
 
 @pytest.mark.parametrize("family", STANDING)
 def test_no_jump_above_one_metre(plays, family):
-    """Measured: 0.69 m; 0.93 m is the highest that 3,600 guided tries found."""
+    """Measured: 0.58 m. A guided search (3,600 scripts) that starts in a crouch gets just to 1 m."""
     assert plays[family].height.max() < 1.0
 
 
 @pytest.mark.parametrize("family", STANDING)
 def test_feet_stay_near_the_surface(plays, family):
-    """The published contact is soft: a foot may sink, but must not tunnel.
+    """A foot may sink at an impact, but must not tunnel.
 
-    Measured: 10 cm at the hardest landings, half of the worlds stay under 6 cm.
+    Measured: 5.5 cm at the hardest landings, half of the worlds stay under 3 cm: at 5 ms a step, this is
+    as stiff as the engine allows.
     """
-    depth = plays[family].depth
-    assert depth.max() < 0.12
+    assert plays[family].depth.max() < 0.08
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_joints_stay_near_their_range(plays, family):
-    """Measured: 0.3 rad under bang-bang targets that run into the stop at full speed."""
-    assert plays[family].over.max() < 0.4
+    """Measured: 0.18 rad under bang-bang targets that run into the stop at full speed."""
+    assert plays[family].over.max() < 0.3
 
 
 def test_a_standing_foot_sinks_little():
-    """Home pose held: measured 12 mm, of the 22 mm over which the published contact hardens."""
+    """Home pose held: measured under 1 mm."""
     model = load()
     q, v = start("home", model, 1, np.random.default_rng(0))
     p = play(model, q, v, np.tile(HOME, (TICKS, 1, 1)))
-    assert p.depth[-1] < 0.02
-    assert np.abs(p.speed[-1]).max() < 0.01
+    assert -0.001 < p.depth[-1, 0] < 0.001
+    assert np.abs(p.speed[-1]).max() < 0.1
