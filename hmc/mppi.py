@@ -57,7 +57,8 @@ class Mppi(Mode):
               w_s \propto \exp(-(J_s - \min J) / (\lambda \, \mathrm{std} J))
 
     Between re-plans the plan runs open loop; a re-plan starts from the plan shifted by the steps taken.
-    Memory: the knots, then the number of steps taken since entry.
+    Memory: the knots, then the number of steps taken since entry. The last `MEMO` re-plans are kept:
+    the same situation is never rolled out twice.
 
     Args:
         name: of the mode.
@@ -70,6 +71,8 @@ class Mppi(Mode):
         basis: (d, nu) directions of the noise; default: every input by itself.
         seed: of the noise.
     """
+
+    MEMO = 20_000
 
     def __init__(
         self,
@@ -93,7 +96,7 @@ class Mppi(Mode):
         self._make_sim = make_sim
         self._sim: Sim | None = None
         self.spline = _spline(cfg.horizon, cfg.knots)
-        self.control_steps = 0
+        self._known: dict[bytes, Tensor] = {}
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
         n = len(x)
@@ -108,7 +111,7 @@ class Mppi(Mode):
         now = (phase == 0).nonzero().squeeze(1)
         if len(now):
             shifted = self._shift(theta[now], x[now], taken[now])
-            theta[now] = self._replan_once(x[now], u[now], shifted, k[now])
+            theta[now] = self._replan_known(x[now], u[now], shifted, k[now])
         action = (self.spline.to(x)[phase][:, None] @ theta).squeeze(1)
         action = action.clamp(self.lower.to(x), self.upper.to(x))
         return action, torch.cat([theta.reshape(n, -1), (taken + 1)[:, None]], 1)
@@ -140,16 +143,20 @@ class Mppi(Mode):
                 moved[rows] = held
         return torch.where(started[:, None, None], moved, theta)
 
-    def _replan_once(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
-        """`_replan`, done once for worlds that are in the same situation, as schedules with a common
-        beginning are."""
-        n = len(x)
-        rows = torch.cat([x, u, theta.reshape(n, -1), k[:, None].to(x)], 1)
-        unique, inverse = torch.unique(rows, dim=0, return_inverse=True)
-        first = torch.full((len(unique),), n, device=x.device).scatter_reduce(
-            0, inverse, torch.arange(n, device=x.device), "amin"
-        )
-        return self._replan(x[first], u[first], theta[first], k[first])[inverse]
+    def _replan_known(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
+        """`_replan`, once for each situation: schedules with a common beginning share it, and a search
+        comes back to the same beginnings again and again."""
+        rows = torch.cat([x, u, theta.reshape(len(x), -1), k[:, None].to(x)], 1).cpu().contiguous().numpy()
+        keys = [row.tobytes() for row in rows]
+        new = {key: i for i, key in enumerate(keys) if key not in self._known}
+        if new:
+            at = torch.tensor(list(new.values()), device=x.device)
+            found = self._replan(x[at], u[at], theta[at], k[at])
+            self._known.update(zip(new, found, strict=True))
+        plans = torch.stack([self._known[key] for key in keys])
+        while len(self._known) > self.MEMO:
+            del self._known[next(iter(self._known))]
+        return plans
 
     def _replan(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
         for iteration in range(self.cfg.iterations):

@@ -14,7 +14,7 @@ from hmc.budget import Budget, Meter
 from hmc.evaluate import Evaluator
 from hmc.schedule import Schedule, Switch, SwitchSpace
 from hmc.sim.base import Sim
-from hmc.solvers import SOLVERS, Search, run
+from hmc.solvers import ORDERS, SOLVERS, Search, run
 from hmc.start import Start, Vector, make_start
 from hmc.task import Task
 
@@ -119,6 +119,7 @@ def plan(
     schedule: Sequence[int | str] | None = None,
     solver: str = "sample",
     samples: int = 64,
+    order: str = "uniform",
     iterations: int | None = None,
     budget: Budget | None = None,
     tolerance: float = 1e-6,
@@ -144,6 +145,8 @@ def plan(
         solver: "sample" (Algorithms 1 and 2) takes the best of the first batch that improves; "exhaustive"
             (Algorithm 1) evaluates all of Omega and takes the best.
         samples: N, switches drawn a batch.
+        order: of "sample"'s draws: "uniform", as Theorem 2 has it, or "tails": the switches that last to
+            the end of the horizon first. Either way each switch comes once.
         iterations: at most this many switches are accepted; None for as many as improve.
         budget: limits on draws, control steps and seconds.
         tolerance: a switch counts if it lowers the cost by more than this share of it.
@@ -154,7 +157,9 @@ def plan(
     Raises:
         PlanInterrupted: on Ctrl-C; a KeyboardInterrupt that carries the best plan so far.
     """
-    _check(solver, samples, iterations, tolerance)
+    _known("solver", solver, SOLVERS)
+    _known("order", order, ORDERS)
+    _check(samples, iterations, tolerance)
     size = len(SwitchSpace(len(task.modes), task.horizon))
     sim = sim if sim is not None else task.make_sim(min(samples, size))
     if isinstance(x, Start):
@@ -165,7 +170,7 @@ def plan(
     start = make_start(task, sim, x, u, mode, memory, k, snapshot)
     meter = Meter(budget or Budget(), Evaluator(task, sim, start))
     incumbent = _incumbent(task, start, mode, schedule)
-    search = Search(meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed))
+    search = Search(meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed), order)
     if progress is not None:
         search.report = lambda search: progress(_plan(search, incumbent))
     try:
@@ -211,11 +216,14 @@ def _plan(search: Search, incumbent: Schedule) -> Plan:
     )
 
 
-def _check(solver: str, samples: int, iterations: int | None, tolerance: float) -> None:
-    if solver not in SOLVERS:
-        near = difflib.get_close_matches(solver, SOLVERS, 1)
+def _known(what: str, name: str, names: Mapping[str, object]) -> None:
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"unknown solver {solver!r}: expected one of {', '.join(SOLVERS)}{hint}")
+        raise ValueError(f"unknown {what} {name!r}: expected one of {', '.join(names)}{hint}")
+
+
+def _check(samples: int, iterations: int | None, tolerance: float) -> None:
     if samples < 1:
         raise ValueError(f"samples must be at least 1 switch a batch, got {samples}")
     if iterations is not None and iterations < 0:

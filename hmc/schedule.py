@@ -203,6 +203,39 @@ class Draws:
         return torch.tensor(drawn, dtype=torch.long)
 
 
+class TailsFirst:
+    """Every switch once: those that last to the end of the horizon first, then the rest, both shuffled.
+
+    Once a plan exists it is mostly the moment of handing over that is wrong, and the M T switches that
+    hand over for good are few beside the Z of all. The interface is that of `Draws`.
+    """
+
+    def __init__(self, space: SwitchSpace, rng: np.random.Generator):
+        self._space = space
+        tails = [
+            space.index(Switch(mode, start, space.horizon - start))
+            for mode in range(space.num_modes)
+            for start in range(space.horizon)
+        ]
+        self._tails = rng.permutation(tails)
+        self._rest = Draws(len(space), rng)
+        self.left = len(space)
+
+    def take(self, n: int) -> Tensor:
+        """The next n indices, or all that are left if fewer, (n,) long."""
+        n = min(n, self.left)
+        head, self._tails = self._tails[:n], self._tails[n:]
+        self.left -= n
+        parts = [torch.from_numpy(head)]
+        missing = n - len(head)
+        while missing > 0:
+            drawn = self._rest.take(missing)
+            _, start, duration = self._space.split(drawn)
+            parts.append(drawn[start + duration < self._space.horizon])
+            missing -= len(parts[-1])
+        return torch.cat(parts)
+
+
 class InOrder:
     """Indices 0 <= index < size, ascending, with the interface of `Draws`."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hmc.budget import Meter
 from hmc.evaluate import Evaluator
-from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace
+from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
 
 
 @dataclass
@@ -26,6 +26,7 @@ class Search:
         samples: N, switches a batch.
         tolerance: a switch counts only when it lowers the cost by more than this share of it.
         rng: where draws come from.
+        order: of the draws, one of ORDERS.
         report: told after every batch and accepted switch; False ends the search.
         costs: the incumbent's cost, then the cost after each accepted switch.
         switches: accepted switches.
@@ -39,6 +40,7 @@ class Search:
     samples: int
     tolerance: float
     rng: np.random.Generator
+    order: str = "uniform"
     report: Callable[[Search], bool | None] = lambda _: None
     costs: list[float] = field(default_factory=list)
     switches: list[Switch] = field(default_factory=list)
@@ -58,7 +60,7 @@ class Search:
         cost = self.costs[-1]
         return cost - self.tolerance * abs(cost) if math.isfinite(cost) else cost
 
-    def batches(self, order: Draws | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
+    def batches(self, order: Draws | TailsFirst | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
         """Switches of Omega in an order, N at a time: indices and costs, (n,) each; inf if not known."""
         while order.left > 0:
             room, limit = self.meter.room(self.samples)
@@ -106,7 +108,8 @@ def sample(search: Search) -> None:
 
     The batch's best is taken, not its first: the whole batch has been rolled out by then.
     """
-    for indices, costs in search.batches(Draws(len(search.space), search.rng)):
+    draws = ORDERS[search.order](search.space, search.rng)
+    for indices, costs in search.batches(draws):
         best = costs.argmin()
         if search.offer(indices[best], costs[best]):
             return
@@ -119,6 +122,10 @@ def exhaustive(search: Search) -> None:
         search.offer(indices[best], costs[best])
 
 
+ORDERS: dict[str, Callable[[SwitchSpace, np.random.Generator], Draws | TailsFirst]] = {
+    "uniform": lambda space, rng: Draws(len(space), rng),
+    "tails": TailsFirst,
+}
 SOLVERS: dict[str, Callable[[Search], None]] = {"sample": sample, "exhaustive": exhaustive}
 
 

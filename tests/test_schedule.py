@@ -13,7 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, batch
+from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst, batch
 
 NAMES = ("foot", "jump", "hand")
 modes = st.lists(st.integers(0, 2), min_size=1, max_size=30)
@@ -184,3 +184,13 @@ def test_in_order():
     order = InOrder(5)
     assert [order.take(3).tolist(), order.take(3).tolist(), order.take(3).tolist()] == [[0, 1, 2], [3, 4], []]
     assert order.left == 0
+
+
+@given(num_modes=st.integers(1, 4), horizon=st.integers(1, 12), n=st.integers(1, 40), seed=st.integers(0, 99))
+def test_tails_first_takes_every_switch_once_and_the_tails_before_the_rest(num_modes, horizon, n, seed):
+    space = SwitchSpace(num_modes, horizon)
+    draws, taken = TailsFirst(space, np.random.default_rng(seed)), []
+    while draws.left > 0:
+        taken += draws.take(n).tolist()
+    assert sorted(taken) == list(range(len(space)))
+    assert all(space[i].stop == horizon for i in taken[: num_modes * horizon])

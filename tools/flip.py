@@ -28,6 +28,7 @@ from hmc.go2.observe import pitch  # noqa: E402
 from hmc.go2.stages import Stages, judge  # noqa: E402
 from hmc.go2.stances import FOOTSTAND  # noqa: E402
 from hmc.go2.task import FlipCfg, flip_task  # noqa: E402
+from tools import figures, render  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,13 @@ class SearchCfg:
 
     Attributes:
         samples: switches drawn a batch.
+        order: of the draws, see `hmc.plan`.
         control_steps: control steps that a tick's search may roll out.
     """
 
-    samples: int = 48
-    control_steps: int = 20000
+    samples: int = 24
+    order: str = "tails"
+    control_steps: int = 8000
 
 
 @dataclass(frozen=True)
@@ -140,14 +143,14 @@ def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
     world.reset(x[None], u[None])
     planner = Receding(
         task, seed=seed, schedule=["foot"] * task.horizon, samples=cfg.search.samples,
-        budget=Budget(control_steps=cfg.search.control_steps),
+        order=cfg.search.order, budget=Budget(control_steps=cfg.search.control_steps),
     )
     steps = round(cfg.seconds / world.dt)
     xs, modes, log, terms = [world.x()[0]], [], [], []
     for k in range(steps):
         x, u_prev = world.x(), world.u()
         began = time.perf_counter()
-        tick = planner.tick(x[0], u_prev[0])
+        tick = planner.tick(x[0], u_prev[0], world.save()[0])
         elapsed = 1e3 * (time.perf_counter() - began)
         stage = task.cost.stage_terms(x, tick.u[None], u_prev, torch.tensor([k]))[0] * world.dt
         world.step(tick.u[None])
@@ -193,6 +196,23 @@ def write_json(path: Path, data: Any) -> None:
     partial = path.with_name(path.name + ".partial")
     partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
     os.replace(partial, path)
+
+
+def write_run(out: Path, done: Run, task: Task, cfg: RunCfg, video: bool, console: Console) -> None:
+    """One run's log, figures and video into `out`."""
+    stages = {name: bool(value) for name, value in vars(done.stages).items()}
+    log = out / f"seed_{done.seed}.json"
+    write_json(log, {"seed": done.seed, "stages": stages, "cost": done.cost, "steps": done.log})
+    dt, names = cfg.seconds / len(done.log), [entry["mode"] for entry in done.log]
+    title = f"seed {done.seed}: " + ", ".join(f"{name.replace('_', ' ')} {'yes' if ok else 'no'}" for name, ok in stages.items())
+    x = done.x[:-1]
+    figures.timeline(
+        out / f"seed_{done.seed}_timeline.png", names, pitch(x).numpy(), x[:, 2].numpy(), cfg.task.command * dt, dt, title
+    )
+    terms = done.terms.numpy() / dt
+    figures.cost_terms(out / f"seed_{done.seed}_cost.png", list(task.cost.stage), terms, names, dt)
+    if video and (reason := render.render_run(log)):
+        console.print(reason)
 
 
 def table(runs: list[Run]) -> Table:
@@ -249,7 +269,7 @@ def main(args: Args) -> int:
 
             task = flip_task(cfg.task, seed=seed, threads=args.threads)
             runs.append(run(cfg, task, seed, show))
-            write_json(args.out / f"seed_{seed}.json", {"seed": seed, "steps": runs[-1].log})
+            write_run(args.out, runs[-1], task, cfg, args.video, console)
     if not runs:
         console.print("stopped before the first run ended: nothing written")
         return 1

@@ -70,8 +70,8 @@ class Starts:
         unlocked: draw all kinds from the beginning, as to measure a policy.
     """
 
-    PLACES, ENERGIES = 20, 5
-    ENERGY_LOW, ENERGY_HIGH = 0.4, 1.4
+    PLACES, ENERGIES = 20, 7
+    ENERGY_LOW, ENERGY_HIGH = 0.0, 1.4
 
     def __init__(self, stance: Stance, cfg: StartsCfg, device: torch.device, *, unlocked: bool = False):
         self.stance, self.cfg, self.device = stance, cfg, device

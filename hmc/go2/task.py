@@ -155,12 +155,7 @@ def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Mppi:
     single = cfg.asymmetry * torch.diag(torch.tensor([cfg.hip, 1.0, 1.0] * 4))
     guess = None
     if cfg.guess:
-        points = torch.tensor(cfg.guess, dtype=torch.float64)
-        at = torch.arange(cfg.spacing * (len(points) - 1) + 1) / cfg.spacing
-        low = at.floor().long().clamp(max=len(points) - 2)
-        dense = points[low] + (at - low)[:, None] * (points[low + 1] - points[low])
-        hip = torch.zeros(len(dense), 1, dtype=dense.dtype)
-        guess = torch.cat([hip, dense[:, :2], hip, dense[:, :2], hip, dense[:, 2:], hip, dense[:, 2:]], 1)
+        guess = dense_guess(torch.tensor(cfg.guess, dtype=torch.float64), cfg.spacing)
     return Mppi(
         "jump",
         cfg.mppi,
@@ -172,6 +167,15 @@ def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Mppi:
         basis=torch.cat([symmetric, single]).double(),
         seed=seed,
     )
+
+
+def dense_guess(points: Tensor, spacing: int) -> Tensor:
+    """Inputs (G, 12) of a left-right symmetric motion through points (P, 4), `spacing` steps apart."""
+    at = torch.arange(spacing * (len(points) - 1) + 1) / spacing
+    low = at.floor().long().clamp(max=len(points) - 2)
+    dense = points[low] + (at - low)[:, None] * (points[low + 1] - points[low])
+    hip, front, rear = torch.zeros(len(dense), 1, dtype=dense.dtype), dense[:, :2], dense[:, 2:]
+    return torch.cat([hip, front, hip, front, hip, rear, hip, rear], 1)
 
 
 def make_sim(num_worlds: int, substeps: int = 4, threads: int = 0) -> Sim:

@@ -1,0 +1,109 @@
+"""Video and time-lapse of a recorded run: `python tools/render.py out/flip/seed_0.json`."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+BACKENDS = ("egl", "osmesa", "glfw")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line.
+
+    Attributes:
+        log: seed_*.json of tools/flip.py.
+        video: .mp4 to write; default: beside the log.
+        strip: .png with frames of the flip side by side; default: beside the log.
+        frames: of the strip.
+        width: of the video [pixels].
+        height: of the video [pixels].
+    """
+
+    log: Path
+    video: Path | None = None
+    strip: Path | None = None
+    frames: int = 9
+    width: int = 640
+    height: int = 480
+
+
+def render_run(log: Path) -> str:
+    """Render in a process of its own, with the first OpenGL backend that works; "" or why it did not."""
+    reason = ""
+    for backend in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else BACKENDS:
+        done = subprocess.run(
+            [sys.executable, __file__, "--log", str(log)],
+            env={**os.environ, "MUJOCO_GL": backend},
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode == 0:
+            return ""
+        reason = (done.stderr.strip().splitlines() or ["unknown error"])[-1]
+    return f"no video: OpenGL is missing here ({reason}); everything else is written"
+
+
+def main(args: Args) -> None:
+    """Render one run."""
+    import imageio.v2 as imageio
+    import numpy as np
+
+    steps = json.loads(args.log.read_text(encoding="utf-8"))["steps"]
+    states = np.array([step["x"] for step in steps])
+    video = args.video or args.log.with_suffix(".mp4")
+    partial = video.with_suffix(".partial.mp4")
+    chosen = strip_steps([step["mode"] for step in steps], args.frames)
+    kept = []
+    with imageio.get_writer(partial, fps=50, macro_block_size=16, quality=7) as writer:
+        for step, image in enumerate(images(states, args.width, args.height)):
+            writer.append_data(image)
+            if step in chosen:
+                kept.append(image)
+    os.replace(partial, video)
+    middle = slice(args.width // 2 - args.width // 4, args.width // 2 + args.width // 4)
+    imageio.imwrite(args.strip or args.log.with_suffix(".png"), np.hstack([image[:, middle] for image in kept]))
+
+
+def strip_steps(modes: list[str], frames: int) -> list[int]:
+    """Steps to show: evenly from just before the first jump to just after the last one ended."""
+    jumps = [step for step, mode in enumerate(modes) if mode != "foot"]
+    first = max(jumps[0] - 6, 0) if jumps else 0
+    last = min(first + 64, len(modes) - 1)
+    return sorted({round(first + (last - first) * i / (frames - 1)) for i in range(frames)})
+
+
+def images(states, width: int, height: int) -> Iterator:  # type: ignore[no-untyped-def]
+    """Pictures (height, width, 3) uint8 of states (n, 37), the camera following the robot."""
+    import mujoco
+
+    from hmc.go2.model import load_model
+
+    model = load_model()
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
+    camera.distance, camera.azimuth, camera.elevation = 2.0, 90.0, -8.0
+    with mujoco.Renderer(model, height, width) as renderer:
+        follow = states[0, 0]
+        for x in states:
+            data.qpos[:] = x[:19]
+            mujoco.mj_forward(model, data)
+            follow += 0.1 * (x[0] - follow)
+            camera.lookat[:] = [follow, x[1], 0.4]
+            renderer.update_scene(data, camera)
+            yield renderer.render()
+
+
+if __name__ == "__main__":
+    import tyro
+
+    main(tyro.cli(Args))
