@@ -70,7 +70,7 @@ class Plan:
     def coverage(self) -> float:
         """n / Z: share of `schedule`'s single switches known not to improve it.
 
-        The chance that a best one of them, if any improves, would have been drawn by now (Theorem 2).
+        With draws in uniform order, the chance that a best one of them would have come by now (Theorem 2).
         """
         return self.seen / self.space_size
 

@@ -51,7 +51,7 @@ class Receding:
         seed: of the draws; each tick draws from (seed, k).
         k: control step of the first tick.
         sim: simulator to plan in; made once if left out.
-        solver, samples, iterations, budget, tolerance, progress: as in `plan`, for every tick.
+        solver, samples, order, iterations, budget, tolerance, progress: as in `plan`, for every tick.
     """
 
     def __init__(
@@ -64,6 +64,7 @@ class Receding:
         sim: Sim | None = None,
         solver: str = "sample",
         samples: int = 64,
+        order: str = "uniform",
         iterations: int | None = None,
         budget: Budget | None = None,
         tolerance: float = 1e-6,
@@ -80,6 +81,7 @@ class Receding:
             sim=self.sim,
             solver=solver,
             samples=samples,
+            order=order,
             iterations=iterations,
             budget=budget,
             tolerance=tolerance,

@@ -26,13 +26,13 @@ FAR = [1.5, 1.0]
     samples=st.integers(4, 60),
     draws=st.none() | st.integers(1, 80),
     seed=st.integers(0, 9),
+    order=st.sampled_from(["uniform", "tails"]),
 )
 @settings(max_examples=40)
-def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed):
+def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, order):
     task = toy_task(5)
-    result = plan(
-        task, x, schedule=incumbent, solver=solver, samples=samples, budget=Budget(draws=draws), seed=seed
-    )
+    options = {"solver": solver, "samples": samples, "seed": seed, "order": order}
+    result = plan(task, x, schedule=incumbent, budget=Budget(draws=draws), **options)
     assert result.incumbent.modes == tuple(incumbent)
     assert result.incumbent_cost == slow_cost(task, incumbent, x)
     assert result.cost == slow_cost(task, result.schedule, x)
@@ -272,6 +272,11 @@ BAD = {
         {"solver": "samples"},
         ValueError,
         "unknown solver 'samples': expected one of sample, .*did",
+    ),
+    "unknown order": (
+        {"order": "tail"},
+        ValueError,
+        "unknown order 'tail': expected one of uniform, tails; did",
     ),
     "no samples": ({"samples": 0}, ValueError, "samples must be at least 1"),
     "iterations": ({"iterations": -1}, ValueError, "iterations must be >= 0"),
