@@ -42,6 +42,12 @@ class Mode(ABC):
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         """Action for this control step, (n, nu), and the memory after it, (n, memory_size)."""
 
+    def forget(self) -> None:  # noqa: B027
+        """Drop what was kept from earlier calls for speed's sake.
+
+        A search calls it first, so that what it spends does not depend on what ran before it.
+        """
+
 
 class ModeSet(Sequence[Mode]):
     """An ordered set of modes; a schedule refers to them by index."""

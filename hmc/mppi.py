@@ -116,6 +116,9 @@ class Mppi(Mode):
         action = action.clamp(self.lower.to(x), self.upper.to(x))
         return action, torch.cat([theta.reshape(n, -1), (taken + 1)[:, None]], 1)
 
+    def forget(self) -> None:
+        self._known.clear()
+
     def _prior(self, x: Tensor, steps: int) -> Tensor:
         """Knots of the guess from `steps` after entry on, (n, K, nu)."""
         assert self.guess is not None

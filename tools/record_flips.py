@@ -1,0 +1,79 @@
+"""Record states met in flips: `python tools/record_flips.py --out out/flips.pt`.
+
+The foot mode holds its stance, the jump mode takes over, and the state is kept that the robot is in after
+a random number of steps. Policies are trained and measured on such files (train/starts.py, train/evaluate.py).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import torch  # noqa: E402
+import tyro  # noqa: E402
+from rich.progress import track  # noqa: E402
+
+from hmc.cfg import load  # noqa: E402
+from hmc.go2.task import flip_task, make_sim  # noqa: E402
+from tools.flip import RunCfg  # noqa: E402
+from tools.jump_guess import settled_stands  # noqa: E402
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line.
+
+    Attributes:
+        out: file to write: states "x" (n, 37), inputs "u" (n, 12), steps since the jump began "after" (n,).
+        states: number of jumps, one state of each.
+        first: fewest steps of a jump before its state is kept.
+        last: most.
+        seed: of everything random; training and measurement need different ones.
+        threads: of the engine; 0 for all cores.
+        set: overrides of cfg/flip.toml.
+    """
+
+    out: Path
+    states: int = 500
+    first: int = 18
+    last: int = 30
+    seed: int = 0
+    threads: int = 0
+    set: tuple[str, ...] = ()
+
+
+@torch.no_grad()
+def main(args: Args) -> None:
+    """Jump, keep, write."""
+    torch.manual_seed(args.seed)
+    cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
+    task = flip_task(cfg.task, seed=args.seed, threads=args.threads)
+    jump = task.modes["jump"]
+    x, u = settled_stands(task, cfg, args.states, 1_000_000 * (args.seed + 1), args.threads)
+    sim = make_sim(args.states, threads=args.threads)
+    sim.reset(x, u)
+    after = torch.randint(args.first, args.last + 1, (args.states,))
+    # every robot began its jump at a step of its own, so that their noise differs
+    k = torch.arange(args.states) * 1000
+    memory = jump.reset(x, u, k)
+    kept_x, kept_u = x.clone(), u.clone()
+    for step in track(range(args.last + 1), "jumping"):
+        now = after == step
+        kept_x[now], kept_u[now] = sim.x()[now], sim.u()[now]
+        action, memory = jump.act(sim.x(), sim.u(), memory, k + step)
+        sim.step(action)
+    finite = kept_x.isfinite().all(1)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    partial = args.out.with_suffix(".partial")
+    torch.save({"x": kept_x[finite], "u": kept_u[finite], "after": after[finite]}, partial)
+    os.replace(partial, args.out)
+    print(f"{args.out}: {int(finite.sum())} states")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
