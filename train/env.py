@@ -90,6 +90,7 @@ class StanceEnv(VecEnv):
         self.max_episode_length = cfg.episode_steps
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.starts = Starts(self.stance, cfg.starts, sim.device)
+        self._drawn = (self.starts.shares > 0).nonzero().squeeze(1).tolist()
         noise = cfg.noise
         widths = [noise.gravity] * 3 + [noise.position] * 3 + [noise.velocity] * 3 + [noise.gyro] * 3
         widths += [noise.joint] * 12 + [noise.joint_speed] * 12 + [0.0] * 12
@@ -119,21 +120,24 @@ class StanceEnv(VecEnv):
         x = torch.where(broken[:, None], before, x)
         self._x, self._u = x, u
         self.episode_length_buf += 1
-        terms = stage_rewards(self.cfg.rewards, self.stance, x, before, u, u_prev, self._anchor, self.sim.dt)
-        fallen = self._fallen(x) | broken
+        gap, dt = go2.clearances(x), self.sim.dt
+        terms = stage_rewards(self.cfg.rewards, self.stance, x, before, u, u_prev, self._anchor, dt, gap)
+        fallen = self._fallen(x, gap) | broken
         timeout = (self.episode_length_buf >= self.max_episode_length) & ~fallen
-        reward = torch.stack(list(terms.values())).sum(0).clamp(min=0) * self.sim.dt
+        table = torch.stack(list(terms.values()))
+        reward = table.sum(0).clamp(min=0) * dt
         reward = torch.where(broken, 0.0, reward - self.cfg.rewards.termination * fallen)
         done = fallen | timeout
-        log: dict[str, Any] = {f"/reward/{name}": term.mean() for name, term in terms.items()}
+        log: dict[str, Any] = {
+            f"/reward/{name}": term for name, term in zip(terms, table.mean(1), strict=True)
+        }
         ids = done.nonzero().squeeze(1)
         if len(ids):
-            self.starts.report(self._kind[ids], self._cell[ids], timeout[ids] & self.stance.held(x[ids]))
+            self.starts.report(self._kind[ids], self._cell[ids], (timeout & self.stance.held(x, gap))[ids])
             log["/episode/length"] = self.episode_length_buf[ids].float().mean()
             self._reset(ids)
-        for share, name, rate in zip(self.starts.shares, KINDS, self.starts.rates, strict=True):
-            if share > 0:
-                log[f"/success/{name}"] = rate
+        for kind in self._drawn:
+            log[f"/success/{KINDS[kind]}"] = self.starts.rates[kind]
         log["/success/frontier"] = self.starts.frontier()
         log["/diverged"] = broken.float().sum()
         return self.get_observations(), reward, done, {"time_outs": timeout, "log": log}
@@ -142,8 +146,7 @@ class StanceEnv(VecEnv):
         """Joint targets [rad] of network outputs, both (n, 12)."""
         return (self._pose + self.cfg.action_scale * actions).clamp(self._lower, self._upper)
 
-    def _fallen(self, x: Tensor) -> Tensor:
-        gap = go2.clearances(x)
+    def _fallen(self, x: Tensor, gap: dict[str, Tensor]) -> Tensor:
         touch = (gap["trunk"] < 0) | (gap["thigh"] < 0).any(1) | (gap["calf"] < 0).any(1)
         low = (x[:, 2] < self.cfg.min_height) | (self.stance.uprightness(x) < self.cfg.min_upright)
         late = self.episode_length_buf * self.sim.dt > self.cfg.grace

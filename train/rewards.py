@@ -48,10 +48,20 @@ class RewardCfg:
 
 
 TARGET_HEIGHT = 0.55  # m
+MIDDLE = (go2.Q_UPPER + go2.Q_LOWER) / 2  # of the joints' range [rad]
+REACH = (go2.Q_UPPER - go2.Q_LOWER) / 2 * 0.95  # free of cost about it [rad]
 
 
 def stage_rewards(
-    cfg: RewardCfg, stance: Stance, x: Tensor, before: Tensor, u: Tensor, u_prev: Tensor, anchor: Tensor, dt: float
+    cfg: RewardCfg,
+    stance: Stance,
+    x: Tensor,
+    before: Tensor,
+    u: Tensor,
+    u_prev: Tensor,
+    anchor: Tensor,
+    dt: float,
+    gap: dict[str, Tensor],
 ) -> dict[str, Tensor]:
     """Weighted reward terms of one control step, name -> (n,), not yet multiplied by dt.
 
@@ -64,25 +74,22 @@ def stage_rewards(
         u_prev: those of the step before.
         anchor: (n, 4), see `hmc.go2.observe`.
         dt: control step [s].
+        gap: `clearances` of x.
     """
     q, qd = x[:, 7:19], x[:, 25:37]
-    free = [3 * leg + joint for leg in stance.free for joint in range(3)]
-    held = [3 * leg + joint for leg in stance.support for joint in range(3)]
     height = torch.exp(-(TARGET_HEIGHT - x[:, 2]).clamp(min=0) / 0.1)
     orientation = (0.5 * stance.uprightness(x) + 0.5).square()
     still = torch.exp(-x[:, 19:22].square().sum(1) - 0.1 * x[:, 22:25].square().sum(1))
-    middle = (go2.Q_UPPER + go2.Q_LOWER).to(q) / 2
-    reach = (go2.Q_UPPER - go2.Q_LOWER).to(q) / 2 * 0.95
-    off = q - stance.pose.to(q)
+    off = (q - stance.pose.to(q)).square().reshape(-1, 2, 6).sum(2)  # of the front and the rear pair
     torque = go2.motor_torque(q, qd, u)
     return {
         "height": cfg.height * height,
         "orientation": cfg.orientation * orientation,
         "stillness": cfg.stillness * height * orientation * still,
-        "contact": -cfg.contact * (go2.clearances(x)["foot"][:, list(stance.free)] < 0.005).sum(1),
-        "limits": -cfg.limits * ((q - middle).abs() - reach).clamp(min=0).sum(1),
-        "posture": -cfg.posture * off[:, free].square().sum(1),
-        "stance_posture": -cfg.stance_posture * off[:, held].square().sum(1),
+        "contact": -cfg.contact * (gap["foot"][:, stance.swing] < 0.005).sum(1),
+        "limits": -cfg.limits * ((q - MIDDLE.to(q)).abs() - REACH.to(q)).clamp(min=0).sum(1),
+        "posture": -cfg.posture * off[:, stance.free[0] // 2],
+        "stance_posture": -cfg.stance_posture * off[:, stance.support[0] // 2],
         "power": -cfg.power * (torque * qd).abs().sum(1),
         "acceleration": -cfg.acceleration * ((qd - before[:, 25:37]) / dt).square().sum(1),
         "target_rate": -cfg.target_rate * (u - u_prev).square().sum(1),

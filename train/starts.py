@@ -130,14 +130,9 @@ class Starts:
     def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
         """Learn from ended episodes: their kind, cell and whether they ended standing, all (n,)."""
         success = success.float()
-        for c in cell[kind == WAY].unique():
-            mine = (kind == WAY) & (cell == c)
-            row, column = divmod(int(c), self.ENERGIES)
-            keep = 0.95 ** int(mine.sum())
-            self.success[row, column] = keep * self.success[row, column] + (1 - keep) * success[mine].mean()
-        for k in kind.unique():
-            keep = 0.995 ** int((kind == k).sum())
-            self.rates[k] = keep * self.rates[k] + (1 - keep) * success[kind == k].mean()
+        way = kind == WAY
+        _average(self.success.view(-1), cell[way], success[way], 0.95)
+        _average(self.rates, kind, success, 0.995)
 
     def frontier(self) -> float:
         """Furthest place from which some energy succeeds in more than a third of the episodes."""
@@ -198,3 +193,11 @@ class Starts:
         x[:, 23] += omega
         x[:, 25:37] = self._uniform((n, 12), -1, 1) * cfg.speed
         return x
+
+
+def _average(values: Tensor, index: Tensor, samples: Tensor, keep: float) -> None:
+    """Move each entry of `values` towards the mean of the samples (n,) at its index (n,), by their number."""
+    count = torch.bincount(index, minlength=len(values))
+    total = torch.zeros_like(values).index_add_(0, index, samples)
+    kept = keep**count
+    values.mul_(kept).add_((1 - kept) * total / count.clamp(min=1))

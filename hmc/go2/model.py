@@ -11,6 +11,7 @@ hip and the thigh; the calf is geared by a further 1.917.
 
 from __future__ import annotations
 
+from functools import cache
 from importlib import resources
 
 import mujoco
@@ -55,23 +56,76 @@ def motor_torque(q: Tensor, qd: Tensor, target: Tensor) -> Tensor:
     never exceeds 20.2 N m in either direction; both axes scaled by GEAR for the calf. The engine
     computes the same law as a DC motor whose voltage saturates.
     """
-    gear = GEAR.to(q)
-    torque = KP * (target - q) - KD * qd
-    slope = STALL / NO_LOAD * gear**2
-    top = (STALL * gear - slope * qd).clamp(max=PEAK * gear).clamp(min=-PEAK * gear)
-    bottom = (-STALL * gear - slope * qd).clamp(min=-PEAK * gear).clamp(max=PEAK * gear)
+    stall, peak, negative, slope = _motor(q.dtype, q.device)
+    torque, back = KP * (target - q) - KD * qd, slope * qd
+    top = (stall - back).clamp(negative, peak)
+    bottom = (-stall - back).clamp(negative, peak)
     return torque.clamp(min=bottom, max=top)
+
+
+@cache
+def _motor(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    """Stall torque, peak torque and its negative, slope of the driving line, of each joint, (12,)."""
+    with torch.inference_mode(False):
+        gear = GEAR.to(device, dtype, copy=True)
+        return STALL * gear, PEAK * gear, -PEAK * gear, STALL / NO_LOAD * gear**2
+
+
+# Entries of the rotation matrix, row by row: constant + factor (q_a q_b + sign q_c q_d), q = (w, x, y, z).
+_FACTORS = torch.tensor(
+    [
+        [2, 1, 1, 1, 1, 2, 1, 2, 1],
+        [2, 2, 3, 2, 1, 3, 3, 3, 1],
+        [3, 0, 0, 0, 3, 0, 0, 0, 2],
+        [3, 3, 2, 3, 3, 1, 2, 1, 2],
+    ]
+)
+_SIGNS = torch.tensor(
+    [[1, -1, 1, 1, 1, -1, -1, 1, 1], [-2, 2, 2, 2, -2, 2, 2, 2, -2], [1, 0, 0, 0, 1, 0, 0, 0, 1]]
+)
+
+
+@cache
+def _quadratic(dtype: torch.dtype, device: torch.device, first: int) -> tuple[Tensor, ...]:
+    """Indices (4 entries) and sign, factor, constant (entries,) of the matrix from entry `first` on."""
+    with torch.inference_mode(False):
+        return (
+            _FACTORS[:, first:].reshape(-1).to(device),
+            *_SIGNS[:, first:].to(device, dtype, copy=True).unbind(),
+        )
+
+
+def _entries(quat: Tensor, first: int) -> Tensor:
+    """Entries of the rotation matrix from `first` on, (n, 9 - first)."""
+    index, sign, factor, constant = _quadratic(quat.dtype, quat.device, first)
+    a, b, c, d = quat.index_select(1, index).reshape(len(quat), 4, 9 - first).unbind(1)
+    return constant + factor * (a * b + sign * (c * d))
 
 
 def rotation(quat: Tensor) -> Tensor:
     """Rotation matrices (n, 3, 3), body to world, of unit quaternions (w, x, y, z) (n, 4)."""
-    w, x, y, z = quat.unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, -2)
+    return _entries(quat, 0).reshape(-1, 3, 3)
+
+
+def vertical(quat: Tensor) -> Tensor:
+    """World z of each body axis, (n, 3): the last row of `rotation`. Gravity in the body frame is -this."""
+    return _entries(quat, 6)
+
+
+@cache
+def _sides(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """+1 for left, -1 for right legs; +1 for front, -1 for rear legs, (4,) each."""
+    with torch.inference_mode(False):
+        table = torch.tensor([[1.0, -1.0, 1.0, -1.0], [1.0, 1.0, -1.0, -1.0]], dtype=dtype, device=device)
+        return table[0], table[1]
+
+
+@cache
+def _hips(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """x and y of the hip joints in the base frame [m], (2, 4)."""
+    side, end = _sides(dtype, device)
+    with torch.inference_mode(False):
+        return torch.stack([HIP_X * end, HIP_Y * side])
 
 
 def leg_points(q: Tensor) -> Tensor:
@@ -81,8 +135,7 @@ def leg_points(q: Tensor) -> Tensor:
     """
     joint = q.reshape(-1, 4, 3)
     hip, thigh, knee = joint.unbind(-1)
-    side = q.new_tensor([1.0, -1.0, 1.0, -1.0])
-    end = q.new_tensor([1.0, 1.0, -1.0, -1.0])
+    side, end = _sides(q.dtype, q.device)
     ch, sh = hip.cos(), hip.sin()
 
     def place(forward: Tensor, down: Tensor) -> Tensor:
@@ -114,10 +167,19 @@ def clearances(x: Tensor) -> dict[str, Tensor]:
     Returns:
         foot, thigh, calf, hip: (n, 4) in leg order; trunk (with the head): (n,).
     """
-    turn = rotation(x[:, 3:7])[:, 2]  # world z of each body axis
-    height = x[:, 2]
-    points = leg_points(x[:, 7:19]) @ turn[:, None, :, None]
-    hip, knee, foot = (points.squeeze(-1) + height[:, None, None]).unbind(2)
+    turn, height = vertical(x[:, 3:7]), x[:, 2]
+    # heights of the points of `leg_points`: a leg's plane leans with the hip, its x axis with the body
+    angle = x[:, 7:19].reshape(-1, 4, 3).clone()
+    angle[..., 2] += angle[..., 1]
+    cos, sin = angle.cos(), angle.sin()
+    tx, ty, tz = turn[:, :, None].unbind(1)
+    ch, sh = cos[..., 0], sin[..., 0]
+    root, out = turn[:, :2] @ _hips(x.dtype, x.device), HIP_LENGTH * _sides(x.dtype, x.device)[0]
+    hip = height[:, None] + root + out * (ty * ch + tz * sh)
+    down = ty * sh - tz * ch
+    drop = LINK * (down[..., None] * cos[..., 1:] - tx[..., None] * sin[..., 1:])
+    knee = hip + drop[..., 0]
+    foot = knee + drop[..., 1] - 0.002 * (tx * cos[..., 2] + down * sin[..., 2])
     calf_end = knee + 0.8 * (foot - knee)  # the shin's capsule ends above the foot
     trunk = TRUNK_POINTS.to(x)
     return {

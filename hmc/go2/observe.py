@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hmc.go2.model import rotation
+from hmc.go2.model import rotation, vertical
 
 OBS_SIZE = 48
 OBS_VERSION = 1
@@ -35,7 +35,9 @@ def observe(x: Tensor, u: Tensor, anchor: Tensor) -> Tensor:
     turn = rotation(x[:, 3:7])
     dx, dy = (x[:, :2] - anchor[:, :2]).unbind(-1)
     c, s = anchor[:, 2:].unbind(-1)
-    velocity = (turn.transpose(1, 2) @ x[:, 19:22, None]).squeeze(-1)
+    # entry by entry: a matrix product may round differently in a batch of another size
+    across = turn * x[:, 19:22, None]
+    velocity = across[:, 0] + across[:, 1] + across[:, 2]
     position = torch.stack([c * dx + s * dy, c * dy - s * dx, x[:, 2]], -1)
     return torch.cat([-turn[:, 2], position, velocity, x[:, 22:25], x[:, 7:19], x[:, 25:37], u], -1)
 
@@ -53,5 +55,5 @@ def anchor_of(x: Tensor) -> Tensor:
 
 def pitch(x: Tensor) -> Tensor:
     """Pitch [rad], (n,): -pi/2 with the nose up (foot stand), +pi/2 with the nose down (handstand)."""
-    turn = rotation(x[:, 3:7])
-    return torch.atan2(-turn[:, 2, 0], turn[:, 2, 2])
+    up = vertical(x[:, 3:7])
+    return torch.atan2(-up[:, 0], up[:, 2])

@@ -65,7 +65,8 @@ class Policy(Mode):
         }
         self._check()
         self.name = name or str(self.metadata["mode"])
-        self._pose = torch.tensor(self.metadata["default_pose"], dtype=torch.float64)
+        pose = torch.tensor(self.metadata["default_pose"], dtype=torch.float64)
+        self._targets = torch.stack([pose, go2.Q_LOWER.double(), go2.Q_UPPER.double()])
         self._scale = float(self.metadata["action_scale"])
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
@@ -75,8 +76,8 @@ class Policy(Mode):
         obs = observe(x, u, memory[:, :4]).float().cpu().numpy()
         (output,) = self._session.run(None, {"obs": obs})
         action = torch.from_numpy(np.asarray(output)).to(x)
-        target = self._pose.to(x) + self._scale * action
-        return target.clamp(go2.Q_LOWER.to(x), go2.Q_UPPER.to(x)), memory
+        pose, lower, upper = self._targets.to(x).unbind()
+        return (pose + self._scale * action).clamp(lower, upper), memory
 
     def _check(self) -> None:
         for field, expected in contract().items():
@@ -88,9 +89,11 @@ class Policy(Mode):
             came = self.metadata[field]
             if came != expected:
                 raise ValueError(
-                    f"policy {self.path}: {field} is {came!r}, expected {expected!r}: it was trained for another "
-                    "version of this robot's interface; train and export it again"
+                    f"policy {self.path}: {field} is {came!r}, expected {expected!r}: it was trained for "
+                    "another version of this robot's interface; train and export it again"
                 )
         for field in ("mode", "default_pose", "action_scale"):
             if field not in self.metadata:
-                raise ValueError(f"policy {self.path}: its metadata lacks {field!r}: export it with train/export.py")
+                raise ValueError(
+                    f"policy {self.path}: its metadata lacks {field!r}: export it with train/export.py"
+                )

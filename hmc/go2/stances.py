@@ -32,19 +32,28 @@ class Stance:
     support: tuple[int, int]
     free: tuple[int, int]
 
+    @property
+    def swing(self) -> slice:
+        """The free legs as a slice of `LEGS`."""
+        return slice(self.free[0], self.free[1] + 1)
+
     def uprightness(self, x: Tensor) -> Tensor:
         """Cosine of the angle between the body's x axis and this stance's vertical, (n,)."""
-        return -self.sign * go2.rotation(x[:, 3:7])[:, 2, 0]
+        return -self.sign * go2.vertical(x[:, 3:7])[:, 0]
 
-    def held(self, x: Tensor) -> Tensor:
+    def held(self, x: Tensor, gap: dict[str, Tensor] | None = None) -> Tensor:
         """Whether the robot stands in it for real, (n,) bool.
 
         On the two supporting feet only: trunk, thighs, shins and the other feet off the ground, base
         above 0.45 m, body axis within 20 degrees of vertical. A robot on its shins does not count.
+
+        Args:
+            x: state (n, 37).
+            gap: `clearances` of x, if they are known.
         """
-        gap = go2.clearances(x)
+        gap = gap or go2.clearances(x)
         clear = (gap["trunk"] > 0) & (gap["thigh"] > 0).all(1) & (gap["calf"] > 0).all(1)
-        clear &= (gap["foot"][:, list(self.free)] > 0).all(1)
+        clear &= (gap["foot"][:, self.swing] > 0).all(1)
         return clear & (x[:, 2] > MIN_HEIGHT) & (self.uprightness(x) > math.cos(MAX_TILT))
 
     def state(self) -> Tensor:

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from hmc.cost import Cost
+from hmc.cost import Cost, StageFn
 from hmc.go2 import model as go2
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, Stance
@@ -106,7 +106,7 @@ def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
         return cfg.height * (go2.STANCE_HEIGHT - x[:, 2]).square()
 
     def orientation(x: Tensor, k: Tensor) -> Tensor:
-        gravity = -go2.rotation(x[:, 3:7])[:, 2, :2]
+        gravity = -go2.vertical(x[:, 3:7])[:, :2]
         target = select(k, _gravity_xy(FOOTSTAND, x), _gravity_xy(HANDSTAND, x))
         return cfg.orientation * (gravity - target).square().sum(1)
 
@@ -127,7 +127,7 @@ def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
     def tail(x: Tensor, k: Tensor) -> Tensor:
         return cfg.tail * (height(x) + orientation(x, k) + joints(x, k))
 
-    stage = {
+    stage: dict[str, StageFn] = {
         "height": height,
         "orientation": lambda x, u, u_prev, k: orientation(x, k),
         "joints": lambda x, u, u_prev, k: joints(x, k),
