@@ -16,6 +16,7 @@ import torch  # noqa: E402
 import tyro  # noqa: E402
 from torch import Tensor  # noqa: E402
 
+from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.model import load_model  # noqa: E402
 from hmc.go2.policy import Policy  # noqa: E402
 from hmc.go2.stances import STANCES, Stance  # noqa: E402
@@ -109,13 +110,19 @@ class Args:
     json: Path | None = None
 
 
-def main(args: Args) -> None:
-    """Measure and print."""
-    torch.manual_seed(args.seed)
+def set_up(args: Args) -> tuple[Policy, Starts]:
+    """The policy and the states it begins from."""
     policy = Policy(args.policy)
     shares = {"stance": 0.0, "way": 0.0, "home": 0.0, "recorded": 0.0, args.starts: 1.0}
     cfg = StartsCfg(**shares, records=str(args.records or ""))
-    starts = Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
+    return policy, Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
+
+
+def main(args: Args) -> None:
+    """Measure and print."""
+    torch.manual_seed(args.seed)
+    with one_line_errors():
+        policy, starts = set_up(args)
     result = score(policy, starts, args.starts, args.episodes, args.threads)
     reach, keep = PROTOCOLS[args.starts]
     print(f"{policy.metadata['mode']} from {args.starts}: within {reach} s and held {keep} s: {result}")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import os
+import shlex
 import sys
+import warnings
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -20,19 +23,28 @@ from rsl_rl.models import MLPModel  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
+from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.observe import OBS_SIZE  # noqa: E402
 from hmc.go2.policy import Policy, contract  # noqa: E402
 from hmc.go2.stances import STANCES  # noqa: E402
+from train.config import config_hash, portable  # noqa: E402
 from train.runner import read_checkpoint  # noqa: E402
 
 
 def actor_of(checkpoint: dict[str, Any]) -> MLPModel:
     """The actor network of a checkpoint, in evaluation mode."""
     state = checkpoint["actor_state_dict"]
-    layers = [value.shape[0] for key, value in state.items() if key.startswith("mlp") and key.endswith("weight")]
+    layers = [
+        value.shape[0] for key, value in state.items() if key.startswith("mlp") and key.endswith("weight")
+    ]
     obs = TensorDict({"policy": torch.zeros(1, OBS_SIZE)}, batch_size=[1])
     actor = MLPModel(
-        obs, {"actor": ["policy"]}, "actor", 12, hidden_dims=layers[:-1], activation="swish",
+        obs,
+        {"actor": ["policy"]},
+        "actor",
+        12,
+        hidden_dims=layers[:-1],
+        activation="swish",
         obs_normalization=True,
         distribution_cfg=dict(class_name="GaussianDistribution", init_std=1.0, std_type="log"),
     )
@@ -55,14 +67,23 @@ def export(checkpoint: Path, out: Path) -> None:
     """Write `out`; it appears only when complete and checked."""
     data = read_checkpoint(checkpoint)
     meta = data["infos"]["meta"]
-    config = json.loads(meta["config"])
+    config = portable(json.loads(meta["config"]))
     stance = STANCES[config["env"]["mode"]]
     module = _Deterministic(actor_of(data))
     partial = out.with_suffix(".partial.onnx")
-    with redirect_stdout(io.StringIO()):
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
+    with redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch about itself
         torch.onnx.export(
-            module, (torch.zeros(2, OBS_SIZE),), str(partial), input_names=["obs"], output_names=["actions"],
-            dynamic_shapes=({0: torch.export.Dim("batch")},), external_data=False, dynamo=True, verbose=False,
+            module,
+            (torch.zeros(2, OBS_SIZE),),
+            str(partial),
+            input_names=["obs"],
+            output_names=["actions"],
+            dynamic_shapes=({0: torch.export.Dim("batch")},),
+            external_data=False,
+            dynamo=True,
+            verbose=False,
         )
     model = onnx.load(str(partial))
     fields = {
@@ -70,10 +91,10 @@ def export(checkpoint: Path, out: Path) -> None:
         "mode": stance.name,
         "default_pose": [round(float(v), 6) for v in stance.pose],
         "action_scale": config["env"]["action_scale"],
-        "training_command": meta["command"],
+        "training_command": shlex.join(portable(shlex.split(meta["command"]))),
         "training_seed": int(meta["seed"]),
         "training_config": config,
-        "training_config_sha256": meta["config_sha256"],
+        "training_config_sha256": config_hash(config),
         "environment_steps": int(data["infos"]["steps"]),
     }
     del model.metadata_props[:]
@@ -86,7 +107,9 @@ def export(checkpoint: Path, out: Path) -> None:
 
 def main(checkpoint: Path, out: Path, /) -> None:
     """Export CHECKPOINT (written by train/ppo.py) to OUT."""
-    export(checkpoint, out)
+    with one_line_errors():
+        out.parent.mkdir(parents=True, exist_ok=True)
+        export(checkpoint, out)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import shlex
+import os
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -16,50 +15,13 @@ sys.path.insert(0, str(ROOT))
 import torch  # noqa: E402
 import tyro  # noqa: E402
 
-from hmc.cfg import digest, load  # noqa: E402
+from hmc.cfg import load  # noqa: E402
+from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.model import load_model  # noqa: E402
-from hmc.sim.mujoco import MujocoSim  # noqa: E402
-from train.env import EnvCfg, StanceEnv  # noqa: E402
+from hmc.sim.make import make_sim  # noqa: E402
+from train.config import TrainCfg, metadata, rsl_config  # noqa: E402
+from train.env import StanceEnv  # noqa: E402
 from train.runner import Runner  # noqa: E402
-
-
-@dataclass(frozen=True)
-class PpoCfg:
-    """Proximal policy optimisation, as rsl-rl names it (small batches: notes in docs/training.md).
-
-    Attributes:
-        iterations: updates.
-        steps: environment steps a world and update.
-        epochs: passes over a batch.
-        minibatches: of each pass.
-        learning_rate: fixed.
-        gamma: discount a control step.
-        lam: of the generalised advantage.
-        entropy: weight of the action entropy.
-        clip: of the probability ratio.
-        init_std: of the action noise, in network units.
-        hidden: layer sizes of actor and critic.
-    """
-
-    iterations: int = 1000
-    steps: int = 24
-    epochs: int = 4
-    minibatches: int = 4
-    learning_rate: float = 3e-4
-    gamma: float = 0.985
-    lam: float = 0.95
-    entropy: float = 0.005
-    clip: float = 0.2
-    init_std: float = 0.35
-    hidden: tuple[int, ...] = (512, 256, 128)
-
-
-@dataclass(frozen=True)
-class TrainCfg:
-    """An experiment file in cfg/."""
-
-    env: EnvCfg
-    ppo: PpoCfg = field(default_factory=PpoCfg)
 
 
 @dataclass(frozen=True)
@@ -69,7 +31,7 @@ class Args:
     Attributes:
         mode: which mode; its settings are in cfg/MODE.toml.
         engine: auto takes MuJoCo Warp where a GPU is there, else C MuJoCo.
-        device: of networks and of the Warp engine, such as cuda:0.
+        device: of engine and networks, such as cpu or cuda:0; auto takes a GPU if there is one.
         threads: of the C engine and of torch; 0 for all cores.
         seed: of everything random.
         out: folder for checkpoints and logs; default out/train/MODE.
@@ -77,7 +39,7 @@ class Args:
         checkpoint: a file to begin from (weights, optimiser, curriculum).
         iterations: overrides the configuration's.
         set: overrides, such as env.rewards.power=0.001.
-        play: a checkpoint to show instead of training.
+        play: a checkpoint to record an episode of, instead of training.
     """
 
     mode: Literal["handstand", "footstand"]
@@ -92,58 +54,70 @@ class Args:
     set: tuple[str, ...] = ()
     play: Path | None = None
 
+    @property
+    def folder(self) -> Path:
+        """Where everything is written."""
+        return self.out or ROOT / "out" / "train" / self.mode
 
-def rsl_config(cfg: PpoCfg) -> dict[str, Any]:
-    """rsl-rl's own configuration."""
-    network = dict(
-        class_name="MLPModel", hidden_dims=list(cfg.hidden), activation="swish", obs_normalization=True
-    )
-    noise = dict(class_name="GaussianDistribution", init_std=cfg.init_std, std_type="log")
-    return dict(
-        num_steps_per_env=cfg.steps,
-        save_interval=50,
-        check_for_nan=False,  # the environment isolates broken worlds itself
-        obs_groups={"actor": ["policy"], "critic": ["critic"]},
-        actor={**network, "distribution_cfg": noise},
-        critic=dict(network),
-        algorithm=dict(
-            class_name="PPO",
-            num_learning_epochs=cfg.epochs,
-            num_mini_batches=cfg.minibatches,
-            learning_rate=cfg.learning_rate,
-            schedule="fixed",
-            gamma=cfg.gamma,
-            lam=cfg.lam,
-            entropy_coef=cfg.entropy,
-            clip_param=cfg.clip,
-            max_grad_norm=1.0,
-        ),
-    )
+
+def under_torchrun(args: Args) -> Args:
+    """Under torchrun each process has a GPU and a seed of its own; else the arguments as they are."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return args
+    if not torch.cuda.is_available():
+        raise ValueError(
+            "torchrun starts one process a GPU and there is none here: run python train/ppo.py alone"
+        )
+    rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
+    return replace(args, device=f"cuda:{local}", seed=args.seed + 1000 * rank)
+
+
+def set_up(args: Args) -> Runner:
+    """Everything that training needs; what the user got wrong is a ValueError."""
+    cfg = load(ROOT / "cfg" / f"{args.mode}.toml", TrainCfg, args.set)
+    args = under_torchrun(args)
+    torch.manual_seed(args.seed)
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    device = None if args.device == "auto" else args.device
+    sim = make_sim(load_model(), cfg.env.worlds, args.engine, device=device, threads=args.threads)
+    env = StanceEnv(cfg.env, sim)
+    meta = metadata(cfg, sys.argv[1:], args.seed)
+    runner = Runner(env, rsl_config(cfg.ppo), str(args.folder), str(sim.device), meta)
+    checkpoint = args.checkpoint or (args.folder / "latest.pt" if args.resume else None)
+    if checkpoint is not None:
+        runner.resume(str(checkpoint))
+    runner.last_iteration = args.iterations or cfg.ppo.iterations
+    return runner
+
+
+def train(runner: Runner, folder: Path) -> None:
+    """Train to the last iteration, or until Ctrl-C."""
+    first = runner.current_learning_iteration
+    if first >= runner.last_iteration:
+        print(f"{first} iterations are done already: ask for more with --iterations")
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    with runner.table.live or contextlib.nullcontext():
+        try:
+            runner.learn(runner.last_iteration - first, init_at_random_ep_len=first == 0)
+        except KeyboardInterrupt:
+            done = runner.save_interrupted()
+            note = f"go on with --resume (checkpoint in {folder})" if done else "nothing was learned yet"
+            print(f"stopped; {note}")
 
 
 def main(args: Args) -> None:
     """Train, or play."""
-    cfg = load(ROOT / "cfg" / f"{args.mode}.toml", TrainCfg, args.set)
-    torch.manual_seed(args.seed)
-    if args.threads:
-        torch.set_num_threads(args.threads)
-    sim = MujocoSim(load_model(), cfg.env.worlds, threads=args.threads)
-    env = StanceEnv(cfg.env, sim)
-    out = args.out or ROOT / "out" / "train" / args.mode
-    out.mkdir(parents=True, exist_ok=True)
-    meta = {"command": shlex.join(["python", "train/ppo.py", *sys.argv[1:]]), "seed": str(args.seed),
-            "config": json.dumps(asdict(cfg)), "config_sha256": digest(cfg)}
-    runner = Runner(env, rsl_config(cfg.ppo), str(out), str(sim.device), meta)
-    checkpoint = args.checkpoint or (out / "latest.pt" if args.resume else None)
-    if checkpoint is not None:
-        runner.resume(str(checkpoint))
-    iterations = (args.iterations or cfg.ppo.iterations) - runner.current_learning_iteration
-    with runner.table.live or contextlib.nullcontext():
-        try:
-            runner.learn(iterations, init_at_random_ep_len=checkpoint is None)
-        except KeyboardInterrupt:
-            runner.save(str(out / f"model_{runner.current_learning_iteration}.pt"))
-            print(f"stopped; go on with --resume (checkpoint in {out})")
+    if args.play is not None:
+        from train.play import play
+
+        with one_line_errors():
+            print(play(args.play, args.mode, args.folder, seed=args.seed, threads=args.threads))
+        return
+    with one_line_errors():
+        runner = set_up(args)
+    train(runner, args.folder)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import random
+import shutil
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -43,18 +44,25 @@ class Runner(OnPolicyRunner):
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             super().__init__(env, cfg, log_dir, device)
         self.meta = meta
+        self.last_iteration = self.updates = 0
+        self.logger.git_status_repos.clear()  # it looks for its own repository and says that there is none
         self.table = LiveTable(self)
         self._log = self.logger.log
-        self.logger.log = self._log_quietly  # type: ignore[method-assign]
+        self.logger.log = self._log_quietly
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
+        if self.logger.disable_logs:  # another process of torchrun writes
+            return
+        rng = {"torch": torch.get_rng_state(), "numpy": np.random.get_state(), "python": random.getstate()}
+        if torch.cuda.is_available():
+            rng["cuda"] = torch.cuda.get_rng_state(self.device)
         infos = {
             **(infos or {}),
             "meta": self.meta,
             "steps": self.logger.tot_timesteps,
             "seconds": self.logger.tot_time,
             "starts": self.env.starts.state_dict(),
-            "rng": {"torch": torch.get_rng_state(), "numpy": np.random.get_state(), "python": random.getstate()},
+            "rng": rng,
         }
         partial = f"{path}.partial"
         super().save(partial, infos)
@@ -62,23 +70,48 @@ class Runner(OnPolicyRunner):
         latest = Path(path).with_name("latest.pt")
         if latest != Path(path):
             with contextlib.suppress(FileNotFoundError):
-                latest.unlink()
-            os.link(path, latest)
+                os.unlink(partial)
+            try:
+                os.link(path, partial)
+            except OSError:  # a file system without links
+                shutil.copyfile(path, partial)
+            os.replace(partial, latest)
+
+    def save_interrupted(self) -> bool:
+        """Save what was learned when `learn` was interrupted; False if that is nothing."""
+        if not self.updates:
+            return False
+        self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+        return True
 
     def resume(self, path: str, *, fresh_optimizer: bool = False) -> None:
         """Go on from a checkpoint; an error names the file and what is wrong with it."""
         data = read_checkpoint(path)
-        self.load(path, {"actor": True, "critic": True, "optimizer": not fresh_optimizer, "iteration": True},
-                  map_location=self.device)
+        what = {"actor": True, "critic": True, "optimizer": not fresh_optimizer, "iteration": True}
+        try:
+            self.load(path, what, map_location=self.device)
+        except RuntimeError as error:
+            raise ValueError(
+                f"checkpoint {path}: its networks do not fit this configuration, whose hidden layers are "
+                f"{self.cfg['actor']['hidden_dims']}: set ppo.hidden as it was trained with"
+            ) from error
         infos = data["infos"]
         self.current_learning_iteration += 1
         self.logger.tot_timesteps, self.logger.tot_time = infos["steps"], infos["seconds"]
         self.env.starts.load_state_dict(infos["starts"])
-        torch.set_rng_state(infos["rng"]["torch"].cpu())
-        np.random.set_state(infos["rng"]["numpy"])
-        random.setstate(infos["rng"]["python"])
+        if self.gpu_global_rank:  # the other processes of torchrun keep a noise of their own
+            return
+        rng = infos["rng"]
+        torch.set_rng_state(rng["torch"].cpu())
+        np.random.set_state(rng["numpy"])
+        random.setstate(rng["python"])
+        if "cuda" in rng and self.device.startswith("cuda"):
+            torch.cuda.set_rng_state(rng["cuda"].cpu(), self.device)
 
     def _log_quietly(self, **kwargs: Any) -> None:
+        self.updates += 1
+        if self.logger.disable_logs:
+            return
         self.table.update(kwargs, self.logger.ep_extras)
         with contextlib.redirect_stdout(io.StringIO()):
             self._log(**kwargs)
@@ -102,7 +135,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         ) from error
     missing = [key for key in CHECKPOINT_KEYS if not isinstance(data, dict) or key not in data]
     if missing:
-        raise ValueError(f"checkpoint {path}: lacks {', '.join(missing)}; expected a file written by train/ppo.py")
+        raise ValueError(
+            f"checkpoint {path}: lacks {', '.join(missing)}; expected a file written by train/ppo.py"
+        )
     return data
 
 
@@ -122,7 +157,11 @@ class LiveTable:
             for key, value in entry.items():
                 sums[key].append(float(value.mean() if isinstance(value, torch.Tensor) else value))
         means = {key: sum(values) / len(values) for key, values in sums.items()}
-        size = self.runner.cfg["num_steps_per_env"] * self.runner.env.num_envs * self.runner.logger.gpu_world_size
+        size = (
+            self.runner.cfg["num_steps_per_env"]
+            * self.runner.env.num_envs
+            * self.runner.logger.gpu_world_size
+        )
         rate = size / (log["collect_time"] + log["learn_time"])
         left = (log["total_it"] - log["it"] - 1) * size / rate
         head = {
@@ -130,7 +169,7 @@ class LiveTable:
             "environment steps": f"{(self.runner.logger.tot_timesteps + size) / 1e6:.2f} M",
             "steps/s": f"{rate:,.0f}",
             "time left": time.strftime("%H:%M:%S", time.gmtime(left)),
-            "action std": f"{float(log['action_std'].mean()):.3f}",
+            "action std": f"{float(log['action_std'].detach().mean()):.3f}",
         }
         if self.live is not None:
             self.live.update(_table(self.runner.env.cfg.mode, head, means))
@@ -150,10 +189,10 @@ def _table(title: str, head: dict[str, str], means: dict[str, float]) -> Table:
     for key, value in head.items():
         table.add_row(key, value)
     group = ""
-    for key, value in means.items():
+    for key, mean in means.items():
         _, kind, *rest = key.split("/")
         if kind != group:
             table.add_section()
             group = kind
-        table.add_row(" ".join([kind, *rest]), f"{value:.3f}")
+        table.add_row(" ".join([kind, *rest]), f"{mean:.3f}")
     return table

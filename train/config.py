@@ -1,0 +1,118 @@
+"""What an experiment file of cfg/ sets, and what a checkpoint says about how it was made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from train.env import EnvCfg
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class PpoCfg:
+    """Proximal policy optimisation, as rsl-rl names it (small batches: notes in docs/training.md).
+
+    Attributes:
+        iterations: updates.
+        steps: environment steps a world and update.
+        epochs: passes over a batch.
+        minibatches: of each pass.
+        learning_rate: fixed.
+        gamma: discount a control step.
+        lam: of the generalised advantage.
+        entropy: weight of the action entropy.
+        clip: of the probability ratio.
+        init_std: of the action noise, in network units.
+        hidden: layer sizes of actor and critic.
+    """
+
+    iterations: int = 1000
+    steps: int = 24
+    epochs: int = 4
+    minibatches: int = 4
+    learning_rate: float = 3e-4
+    gamma: float = 0.985
+    lam: float = 0.95
+    entropy: float = 0.005
+    clip: float = 0.2
+    init_std: float = 0.35
+    hidden: tuple[int, ...] = (512, 256, 128)
+
+
+@dataclass(frozen=True)
+class TrainCfg:
+    """An experiment file in cfg/."""
+
+    env: EnvCfg
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+
+
+def rsl_config(cfg: PpoCfg) -> dict[str, Any]:
+    """rsl-rl's own configuration."""
+    network = dict(
+        class_name="MLPModel", hidden_dims=list(cfg.hidden), activation="swish", obs_normalization=True
+    )
+    noise = dict(class_name="GaussianDistribution", init_std=cfg.init_std, std_type="log")
+    return dict(
+        num_steps_per_env=cfg.steps,
+        save_interval=50,
+        check_for_nan=False,  # the environment isolates broken worlds itself
+        obs_groups={"actor": ["policy"], "critic": ["critic"]},
+        actor={**network, "distribution_cfg": noise},
+        critic=dict(network),
+        algorithm=dict(
+            class_name="PPO",
+            num_learning_epochs=cfg.epochs,
+            num_mini_batches=cfg.minibatches,
+            learning_rate=cfg.learning_rate,
+            schedule="fixed",
+            gamma=cfg.gamma,
+            lam=cfg.lam,
+            entropy_coef=cfg.entropy,
+            clip_param=cfg.clip,
+            max_grad_norm=1.0,
+        ),
+    )
+
+
+def metadata(cfg: TrainCfg, argv: Sequence[str], seed: int) -> dict[str, str]:
+    """What a checkpoint, and the policy exported from it, say about their making."""
+    config = portable(asdict(cfg))
+    return {
+        "command": shlex.join(["python", "train/ppo.py", *portable(list(argv))]),
+        "seed": str(seed),
+        "config": json.dumps(config),
+        "config_sha256": config_hash(config),
+    }
+
+
+def config_hash(config: dict[str, Any]) -> str:
+    """SHA-256 of a configuration as JSON with sorted keys, in hex."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+
+
+def portable(value: Any) -> Any:
+    """A value whose absolute paths, also behind a "=", are relative to the repository.
+
+    A path outside of it is cut down to its name: how this machine's folders are called helps nobody.
+    """
+    if isinstance(value, dict):
+        return {key: portable(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [portable(inner) for inner in value]
+    if not isinstance(value, str):
+        return value
+    key, equals, path = value.rpartition("=")
+    path = path.strip("\"'") if equals else path
+    if not os.path.isabs(path):
+        return value
+    inside = Path(path).is_relative_to(ROOT)
+    return key + equals + (Path(path).relative_to(ROOT).as_posix() if inside else Path(path).name)
