@@ -130,8 +130,13 @@ def disturbed_start(cfg: StartCfg, seed: int) -> tuple[Tensor, Tensor]:
     turn = torch.tensor([1.0, roll, tilt, 0.0], dtype=torch.float64)
     a, b, c, d = (turn / turn.norm()).tolist()
     x[3:7] = torch.tensor(
-        [w * a - qx * b - qy * c - qz * d, w * b + qx * a + qy * d - qz * c,
-         w * c - qx * d + qy * a + qz * b, w * d + qx * c - qy * b + qz * a], dtype=torch.float64
+        [
+            w * a - qx * b - qy * c - qz * d,
+            w * b + qx * a + qy * d - qz * c,
+            w * c - qx * d + qy * a + qz * b,
+            w * d + qx * c - qy * b + qz * a,
+        ],
+        dtype=torch.float64,
     )
     return x, x[7:19].clone()
 
@@ -142,8 +147,12 @@ def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
     x, u = disturbed_start(cfg.start, seed)
     world.reset(x[None], u[None])
     planner = Receding(
-        task, seed=seed, schedule=["foot"] * task.horizon, samples=cfg.search.samples,
-        order=cfg.search.order, budget=Budget(control_steps=cfg.search.control_steps),
+        task,
+        seed=seed,
+        schedule=["foot"] * task.horizon,
+        samples=cfg.search.samples,
+        order=cfg.search.order,
+        budget=Budget(control_steps=cfg.search.control_steps),
     )
     steps = round(cfg.seconds / world.dt)
     xs, modes, log, terms = [world.x()[0]], [], [], []
@@ -160,11 +169,19 @@ def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
         terms.append(stage)
         log.append(
             {
-                "step": k, "time": k * world.dt, "mode": task.modes.names[tick.mode],
-                "schedule": str(plan.schedule), "cost": plan.cost, "stage_cost": float(stage.sum()),
-                "plan_ms": elapsed, "coverage": plan.coverage, "draws": plan.draws,
-                "control_steps": plan.control_steps, "diverged": plan.diverged,
-                "x": [round(v, 6) for v in x[0].tolist()], "u": [round(v, 6) for v in tick.u.tolist()],
+                "step": k,
+                "time": k * world.dt,
+                "mode": task.modes.names[tick.mode],
+                "schedule": str(plan.schedule),
+                "cost": plan.cost,
+                "stage_cost": float(stage.sum()),
+                "plan_ms": elapsed,
+                "coverage": plan.coverage,
+                "draws": plan.draws,
+                "control_steps": plan.control_steps,
+                "diverged": plan.diverged,
+                "x": [round(v, 6) for v in x[0].tolist()],
+                "u": [round(v, 6) for v in tick.u.tolist()],
             }
         )
         if progress is not None:
@@ -204,14 +221,22 @@ def write_run(out: Path, done: Run, task: Task, cfg: RunCfg, video: bool, consol
     log = out / f"seed_{done.seed}.json"
     write_json(log, {"seed": done.seed, "stages": stages, "cost": done.cost, "steps": done.log})
     dt, names = cfg.seconds / len(done.log), [entry["mode"] for entry in done.log]
-    title = f"seed {done.seed}: " + ", ".join(f"{name.replace('_', ' ')} {'yes' if ok else 'no'}" for name, ok in stages.items())
+    title = f"seed {done.seed}: " + ", ".join(
+        f"{name.replace('_', ' ')} {'yes' if ok else 'no'}" for name, ok in stages.items()
+    )
     x = done.x[:-1]
     figures.timeline(
-        out / f"seed_{done.seed}_timeline.png", names, pitch(x).numpy(), x[:, 2].numpy(), cfg.task.command * dt, dt, title
+        out / f"seed_{done.seed}_timeline.png",
+        names,
+        pitch(x).numpy(),
+        x[:, 2].numpy(),
+        cfg.task.command * dt,
+        dt,
+        title,
     )
     terms = done.terms.numpy() / dt
     figures.cost_terms(out / f"seed_{done.seed}_cost.png", list(task.cost.stage), terms, names, dt)
-    if video and (reason := render.render_run(log)):
+    if video and (reason := render.render_run(render.Args(log))):
         console.print(reason)
 
 
@@ -224,8 +249,13 @@ def table(runs: list[Run]) -> Table:
     for item in runs:
         p50, p99 = np.percentile(item.plan_ms, [50, 99])
         view.add_row(
-            str(item.seed), sign[item.stages.foot_stand], sign[item.stages.jump_flip],
-            sign[item.stages.handstand], f"{item.cost:.2f}", f"{p50:.0f}", f"{p99:.0f}",
+            str(item.seed),
+            sign[item.stages.foot_stand],
+            sign[item.stages.jump_flip],
+            sign[item.stages.handstand],
+            f"{item.cost:.2f}",
+            f"{p50:.0f}",
+            f"{p99:.0f}",
         )
     return view
 
@@ -258,12 +288,19 @@ def main(args: Args) -> int:
     console = Console()
     torch.set_num_threads(args.threads or os.cpu_count() or 1)
     runs: list[Run] = []
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=console) as bar, contextlib.suppress(KeyboardInterrupt):
         for seed in range(args.first_seed, args.first_seed + args.seeds):
             job = bar.add_task(f"seed {seed}", total=round(cfg.seconds / 0.02), note="")
 
-            def show(done: int, total: int, entry: dict[str, Any], angle: float, height: float, job: Any = job) -> None:
+            def show(
+                done: int, total: int, entry: dict[str, Any], angle: float, height: float, job: Any = job
+            ) -> None:
                 note = f"{entry['mode']:>5}  pitch {np.degrees(angle):+4.0f}  height {height:.2f} m"
                 bar.update(job, completed=done, total=total, note=note)
 

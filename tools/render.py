@@ -9,11 +9,18 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+import tyro  # noqa: E402
+
 BACKENDS = ("egl", "osmesa", "glfw")
+EVERY = 2  # control steps a picture: without a GPU a picture takes a core 0.2 s
 
 
 @dataclass(frozen=True)
@@ -21,32 +28,27 @@ class Args:
     """Command line.
 
     Attributes:
-        log: seed_*.json of tools/flip.py.
-        video: .mp4 to write; default: beside the log.
-        strip: .png with frames of the flip side by side; default: beside the log.
+        log: seed_*.json of tools/flip.py, or play.json of train/ppo.py --play.
         frames: of the strip.
         width: of the video [pixels].
         height: of the video [pixels].
+        backend: of OpenGL, see MUJOCO_GL; default: the first that works.
     """
 
-    log: Path
-    video: Path | None = None
-    strip: Path | None = None
+    log: tyro.conf.Positional[Path]
     frames: int = 9
     width: int = 640
     height: int = 480
+    backend: str = ""
 
 
-def render_run(log: Path) -> str:
+def render_run(args: Args) -> str:
     """Render in a process of its own, with the first OpenGL backend that works; "" or why it did not."""
+    command = [sys.executable, __file__, str(args.log), "--frames", str(args.frames)]
+    command += ["--width", str(args.width), "--height", str(args.height)]
     reason = ""
     for backend in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else BACKENDS:
-        done = subprocess.run(
-            [sys.executable, __file__, "--log", str(log)],
-            env={**os.environ, "MUJOCO_GL": backend},
-            capture_output=True,
-            text=True,
-        )
+        done = subprocess.run([*command, "--backend", backend], capture_output=True, text=True)
         if done.returncode == 0:
             return ""
         reason = (done.stderr.strip().splitlines() or ["unknown error"])[-1]
@@ -54,35 +56,48 @@ def render_run(log: Path) -> str:
 
 
 def main(args: Args) -> None:
-    """Render one run."""
+    """Render one run: a video and a strip of frames beside its log."""
+    if args.backend:
+        os.environ["MUJOCO_GL"] = args.backend  # read when mujoco is imported
+        draw(args)
+    else:
+        print(render_run(args) or f"{args.log.with_suffix('.mp4')} and {args.log.with_suffix('.png')}")
+
+
+def draw(args: Args) -> None:
+    """Render with the OpenGL backend that is set."""
     import imageio.v2 as imageio
     import numpy as np
 
     steps = json.loads(args.log.read_text(encoding="utf-8"))["steps"]
+    steps = steps[::EVERY]
     states = np.array([step["x"] for step in steps])
-    video = args.video or args.log.with_suffix(".mp4")
+    video = args.log.with_suffix(".mp4")
     partial = video.with_suffix(".partial.mp4")
     chosen = strip_steps([step["mode"] for step in steps], args.frames)
     kept = []
-    with imageio.get_writer(partial, fps=50, macro_block_size=16, quality=7) as writer:
+    writer: Any
+    with imageio.get_writer(partial, fps=50 // EVERY, macro_block_size=16, quality=7) as writer:
         for step, image in enumerate(images(states, args.width, args.height)):
             writer.append_data(image)
             if step in chosen:
                 kept.append(image)
     os.replace(partial, video)
     middle = slice(args.width // 2 - args.width // 4, args.width // 2 + args.width // 4)
-    imageio.imwrite(args.strip or args.log.with_suffix(".png"), np.hstack([image[:, middle] for image in kept]))
+    imageio.imwrite(args.log.with_suffix(".png"), np.hstack([image[:, middle] for image in kept]))
 
 
 def strip_steps(modes: list[str], frames: int) -> list[int]:
-    """Steps to show: evenly from just before the first jump to just after the last one ended."""
+    """Pictures to show: evenly from just before the first jump on, or over all of a run without one."""
+    if len(set(modes)) == 1:
+        return sorted({round((len(modes) - 1) * i / (frames - 1)) for i in range(frames)})
     jumps = [step for step, mode in enumerate(modes) if mode != "foot"]
-    first = max(jumps[0] - 6, 0) if jumps else 0
-    last = min(first + 64, len(modes) - 1)
+    first = max(jumps[0] - 6 // EVERY, 0) if jumps else 0
+    last = min(first + 64 // EVERY, len(modes) - 1)
     return sorted({round(first + (last - first) * i / (frames - 1)) for i in range(frames)})
 
 
-def images(states, width: int, height: int) -> Iterator:  # type: ignore[no-untyped-def]
+def images(states: NDArray[Any], width: int, height: int) -> Iterator[NDArray[Any]]:
     """Pictures (height, width, 3) uint8 of states (n, 37), the camera following the robot."""
     import mujoco
 
@@ -104,6 +119,4 @@ def images(states, width: int, height: int) -> Iterator:  # type: ignore[no-unty
 
 
 if __name__ == "__main__":
-    import tyro
-
     main(tyro.cli(Args))
