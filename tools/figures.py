@@ -9,14 +9,23 @@ import matplotlib
 
 matplotlib.use("Agg")
 
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 COLORS = {"foot": "#4c9f70", "jump": "#d1495b", "hand": "#edae49"}
 
 
 def timeline(
-    path: Path, modes: Sequence[str], pitch: np.ndarray, height: np.ndarray, command: float, dt: float, title: str
+    path: Path,
+    modes: Sequence[str],
+    pitch: np.ndarray,
+    height: np.ndarray,
+    command: float,
+    dt: float,
+    title: str,
 ) -> None:
     """Pitch and height over time, on bands of the running mode.
 
@@ -31,7 +40,9 @@ def timeline(
     """
     time = np.arange(len(modes)) * dt
     figure, axes = plt.subplots(2, 1, sharex=True, figsize=(9, 4.5), constrained_layout=True)
-    for axis, values, label in zip(axes, (np.degrees(pitch), height), ("pitch [deg]", "base height [m]"), strict=True):
+    for axis, values, label in zip(
+        axes, (np.degrees(pitch), height), ("pitch [deg]", "base height [m]"), strict=True
+    ):
         _bands(axis, modes, dt)
         axis.plot(time, values, color="black", linewidth=1.3)
         axis.axvline(command, color="black", linestyle=":", linewidth=1)
@@ -39,7 +50,7 @@ def timeline(
     axes[0].set_yticks([-90, -45, 0, 45, 90])
     axes[0].set_title(title, fontsize=10)
     axes[1].set_xlabel("time [s]; dotted: the command")
-    handles = [plt.Rectangle((0, 0), 1, 1, color=COLORS[name], alpha=0.35) for name in COLORS]
+    handles = [Rectangle((0, 0), 1, 1, color=COLORS[name], alpha=0.35) for name in COLORS]
     axes[0].legend(handles, COLORS, loc="lower right", ncols=3, fontsize=8)
     _save(figure, path)
 
@@ -63,16 +74,18 @@ def cost_terms(path: Path, names: Sequence[str], terms: np.ndarray, modes: Seque
     _save(figure, path)
 
 
-def _bands(axis: plt.Axes, modes: Sequence[str], dt: float) -> None:
+def _bands(axis: Axes, modes: Sequence[str], dt: float) -> None:
     start = 0
     for step in range(1, len(modes) + 1):
         if step == len(modes) or modes[step] != modes[start]:
-            axis.axvspan(start * dt, step * dt, color=COLORS.get(modes[start], "gray"), alpha=0.25, linewidth=0)
+            axis.axvspan(
+                start * dt, step * dt, color=COLORS.get(modes[start], "gray"), alpha=0.25, linewidth=0
+            )
             start = step
     axis.margins(x=0)
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     partial = path.with_suffix(".partial.png")
     figure.savefig(partial, dpi=130)
     plt.close(figure)

@@ -142,7 +142,9 @@ def main(args: Args) -> None:
     each = args.starts * len(args.durations)
     console = Console()
     for iteration in range(args.iterations):
-        x, u = settled_stands(task, cfg, args.starts, 1000 * args.seed + iteration * args.starts, args.threads)
+        x, u = settled_stands(
+            task, cfg, args.starts, 1000 * args.seed + iteration * args.starts, args.threads
+        )
         points = mean + spread * torch.randn(args.candidates, *mean.shape, dtype=torch.float64)
         points[0] = mean
         inputs = torch.stack([dense_guess(p, cfg.task.jump.spacing) for p in points])
@@ -157,8 +159,8 @@ def main(args: Args) -> None:
         mean = 0.3 * mean + 0.7 * points[best].mean(0)
         spread = (0.4 * spread + 0.6 * points[best].std(0)).clamp(min=0.03)
         console.print(
-            f"{iteration + 1}/{args.iterations}: mean guess {float(clean[0]):.0%} caught, best {float(clean.max()):.0%}, "
-            f"spread {float(spread.mean()):.2f}"
+            f"{iteration + 1}/{args.iterations}: mean guess {float(clean[0]):.0%} caught, "
+            f"best {float(clean.max()):.0%}, spread {float(spread.mean()):.2f}"
         )
         rows = ",\n".join("  [" + ", ".join(f"{v:.3f}" for v in row) + "]" for row in mean.tolist())
         args.out.parent.mkdir(parents=True, exist_ok=True)

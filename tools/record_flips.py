@@ -1,7 +1,7 @@
 """Record states met in flips: `python tools/record_flips.py --out out/flips.pt`.
 
 The foot mode holds its stance, the jump mode takes over, and the state is kept that the robot is in after
-a random number of steps. Policies are trained and measured on such files (train/starts.py, train/evaluate.py).
+a random number of steps. Policies are trained (train/starts.py) and measured (train/evaluate.py) on them.
 """
 
 from __future__ import annotations
