@@ -24,6 +24,7 @@ from torch import Tensor  # noqa: E402
 
 from hmc import Budget, Receding, Task  # noqa: E402
 from hmc.cfg import load  # noqa: E402
+from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.observe import pitch  # noqa: E402
 from hmc.go2.stages import Stages, judge  # noqa: E402
 from hmc.go2.stances import FOOTSTAND  # noqa: E402
@@ -283,8 +284,10 @@ class Args:
 
 def main(args: Args) -> int:
     """Run all seeds, write everything, return the exit status."""
-    cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
-    args.out.mkdir(parents=True, exist_ok=True)
+    with one_line_errors():
+        cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
+        flip_task(cfg.task)  # what is wrong with a policy file shows here
+        args.out.mkdir(parents=True, exist_ok=True)
     console = Console()
     torch.set_num_threads(args.threads or os.cpu_count() or 1)
     runs: list[Run] = []
