@@ -56,10 +56,8 @@ class Worlds:
         """
         memory = self._arrive(ids, modes, x, u, k)
         action = torch.empty_like(u)
-        for index, mode in enumerate(self.task.modes):
-            rows = _rows(modes == index)
-            if rows is None:
-                continue
+        for index, rows in _groups(modes):
+            mode = self.task.modes[index]
             size = mode.memory_size
             nested = mode.control_steps
             chosen, after = mode.act(x[rows], u[rows], memory[rows, :size], k[rows])
@@ -79,20 +77,19 @@ class Worlds:
             self.mode[ids] = modes
             memory[entered] = 0.0
             for index, mode in enumerate(self.task.modes):
-                rows = _rows(entered & (modes == index)) if mode.memory_size > 0 else None
-                if rows is not None:
+                rows = (entered & (modes == index)).nonzero().squeeze(1) if mode.memory_size > 0 else ()
+                if len(rows) > 0:
                     fresh = mode.reset(x[rows], u[rows], k[rows])
                     size = (len(k[rows]), mode.memory_size)
                     memory[rows, : size[1]] = _shaped(mode, "reset() memory", fresh, size).to(memory.dtype)
         return memory
 
 
-def _rows(mask: Tensor) -> Tensor | slice | None:
-    """Index of the rows where `mask` (n,) holds: None if nowhere, a cheap slice if everywhere."""
-    rows = mask.nonzero().squeeze(1)
-    if len(rows) == 0:
-        return None
-    return slice(None) if len(rows) == len(mask) else rows
+def _groups(modes: Tensor) -> list[tuple[int, Tensor | slice]]:
+    """The modes in `modes` (n,) in ascending order, each with its rows: a cheap slice if it has all."""
+    if len(modes) > 0 and bool((modes == modes[0]).all()):
+        return [(int(modes[0]), slice(None))]
+    return [(index, (modes == index).nonzero().squeeze(1)) for index in modes.unique().tolist()]
 
 
 def _shaped(mode: Mode, what: str, value: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -165,12 +162,12 @@ def roll(
     for i in range(horizon):
         if stop is not None and stop():
             return None
-        x = sim.x(ids)
+        x = sim.x(_indexed(sim, ids))
         if not bool(x.isfinite().all()):
             ids, modes, terms, x = _keep(finite(x), ids, modes, terms, x)
             if len(ids) == 0:
                 break
-        u_prev, k = sim.u(ids), torch.full_like(ids, start.k + i)
+        u_prev, k = sim.u(_indexed(sim, ids)), torch.full_like(ids, start.k + i)
         u = worlds.act(ids, modes[:, i], x, u_prev, k)
         terms[:, :stages] += stage_terms(worlds.task, x, u, u_prev, k, sim.dt)
         partial = total(terms)
@@ -181,7 +178,7 @@ def roll(
             ids, modes, terms, u = _keep(sound & ~beyond, ids, modes, terms, u)
             if len(ids) == 0:
                 break
-        sim.step(u, ids)
+        sim.step(u, _indexed(sim, ids))
         worlds.control_steps += len(ids)
     if len(ids) > 0:
         x = sim.x(ids)
@@ -193,6 +190,11 @@ def roll(
     diverged = ~result.isfinite() & ~pruned
     result[diverged], parts[diverged] = math.inf, math.nan
     return Rolled(result, parts, diverged, pruned)
+
+
+def _indexed(sim: Sim, ids: Tensor) -> Tensor | None:
+    """Ascending `ids`; None, which costs no indexing, where they are all worlds."""
+    return None if len(ids) == sim.num_worlds else ids
 
 
 def _keep(ok: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:

@@ -39,7 +39,7 @@ class Policy(Mode):
     Args:
         path: ONNX file with its contract in the metadata.
         name: of the mode; default: the file's.
-        threads: of onnxruntime.
+        threads: of onnxruntime; 0 for all cores. Actions do not depend on it.
 
     Raises:
         ValueError: the file cannot be read, or a field of its contract does not match; names it.
@@ -52,6 +52,8 @@ class Policy(Mode):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
+        # idle threads of the network must not spin on the cores that step worlds
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         if not self.path.is_file():
             raise ValueError(f"policy {self.path}: no such file")
         try:

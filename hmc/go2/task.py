@@ -189,14 +189,14 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
     Args:
         cfg: settings.
         seed: of the jump's noise.
-        threads: of the engine; 0 for all cores.
+        threads: of the engine and the policies; 0 for all cores.
     """
     sim = partial(make_sim, substeps=cfg.substeps, threads=threads)
     modes = ModeSet(
         [
-            Policy(policy_path("footstand", cfg.foot), name="foot"),
+            Policy(policy_path("footstand", cfg.foot), name="foot", threads=threads),
             jump_mode(cfg.jump, sim, seed),
-            Policy(policy_path("handstand", cfg.hand), name="hand"),
+            Policy(policy_path("handstand", cfg.hand), name="hand", threads=threads),
         ]
     )
     return Task("flip", modes, stance_cost(cfg.cost, timeline(cfg.command)), cfg.horizon, sim)
