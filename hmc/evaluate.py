@@ -44,8 +44,6 @@ class Evaluator:
     def __init__(self, task: Task, sim: Sim, start: Start):
         self.task, self.sim, self.start = task, sim, start
         self.rollouts = self.diverged = self.pruned = 0
-        for mode in task.modes:
-            mode.forget()
         self._worlds = Worlds(task, sim)
         self._known: dict[bytes, _Known] = {}
 

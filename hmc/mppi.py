@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -41,10 +42,15 @@ class MppiCfg:
         for name in ("horizon", "samples", "replan_every", "iterations", "worlds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"mppi.{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("temperature", "noise"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"mppi.{name} must be a number >= 0, got {getattr(self, name)}")
         if not 2 <= self.knots <= self.horizon:
             raise ValueError(f"mppi.knots must be between 2 and the horizon {self.horizon}, got {self.knots}")
         if self.replan_every > self.horizon:
-            raise ValueError(f"mppi.replan_every must not exceed the horizon {self.horizon}")
+            raise ValueError(
+                f"mppi.replan_every must not exceed the horizon {self.horizon}, got {self.replan_every}"
+            )
 
 
 class Mppi(Mode):
@@ -54,7 +60,8 @@ class Mppi(Mode):
     counter keyed by (seed, k), the same in every world, rolls out the plans theta + eps_s and sets
 
     .. math:: \theta \leftarrow \theta + \sum_s w_s \epsilon_s, \quad
-              w_s \propto \exp(-(J_s - \min J) / (\lambda \, \mathrm{std} J))
+              w_s \propto \exp(-(J_s - \min J) / (\lambda \sigma)), \quad
+              \sigma^2 = \mathrm{mean}_s (J_s - \min J)^2
 
     Between re-plans the plan runs open loop; a re-plan starts from the plan shifted by the steps taken.
     Memory: the knots, then the number of steps taken since entry. The last `MEMO` re-plans are kept:

@@ -126,6 +126,7 @@ def plan(
     seed: int | Sequence[int] = 0,
     progress: Progress | None = None,
     sim: Sim | None = None,
+    forget: bool = True,
 ) -> Plan:
     """Search the mode schedules of `task` from state x, from an incumbent towards lower cost.
 
@@ -153,6 +154,8 @@ def plan(
         seed: of the draws.
         progress: called with the plan so far after every batch and accepted switch; False stops.
         sim: simulator to plan in, made with `task.make_sim`; made anew if left out.
+        forget: let modes drop what they kept from earlier searches. A receding loop keeps it: then what
+            a budget of control steps reaches depends on the ticks before.
 
     Raises:
         PlanInterrupted: on Ctrl-C; a KeyboardInterrupt that carries the best plan so far.
@@ -162,6 +165,9 @@ def plan(
     _check(samples, iterations, tolerance)
     size = len(SwitchSpace(len(task.modes), task.horizon))
     sim = sim if sim is not None else task.make_sim(min(samples, size))
+    if forget:
+        for each in task.modes:
+            each.forget()
     if isinstance(x, Start):
         if any(value is not None for value in (u, mode, memory, snapshot)) or k != 0:
             raise ValueError("a Start has u, mode, memory, k and snapshot inside: do not pass them as well")

@@ -75,6 +75,7 @@ class Receding:
         self.mode: int | None = None
         self.memory: Tensor | None = None
         self.u: Tensor | None = None
+        self._first = True  # what modes keep between ticks is this loop's own
         self._plan = partial(
             plan,
             task,
@@ -99,7 +100,8 @@ class Receding:
         """
         last = self.u if u is None else u
         start = make_start(self.task, self.sim, x, last, self.mode, self.memory, self.k, snapshot)
-        result = self._plan(start, schedule=self.schedule, seed=(self.seed, self.k))
+        result = self._plan(start, schedule=self.schedule, seed=(self.seed, self.k), forget=self._first)
+        self._first = False
         action = self._run(result.schedule[0], start.x, start.u)
         self.schedule = result.schedule.shift()
         self.k += 1

@@ -40,6 +40,8 @@ STANCE_HEIGHT = 0.573
 
 HIP_X, HIP_Y, HIP_LENGTH, LINK = 0.1934, 0.0465, 0.0955, 0.213
 FOOT_RADIUS = 0.022
+HIP_CENTRE = 0.08  # of the hip's sphere, sideways from its joint
+CALF_END = (0.01, 0.17)  # where the shin's capsule ends: forward and down from the knee
 
 
 def load_model() -> mujoco.MjModel:
@@ -175,17 +177,19 @@ def clearances(x: Tensor) -> dict[str, Tensor]:
     tx, ty, tz = turn[:, :, None].unbind(1)
     ch, sh = cos[..., 0], sin[..., 0]
     root, out = turn[:, :2] @ _hips(x.dtype, x.device), HIP_LENGTH * _sides(x.dtype, x.device)[0]
-    hip = height[:, None] + root + out * (ty * ch + tz * sh)
+    lean = ty * ch + tz * sh
+    hip = height[:, None] + root + out * lean
     down = ty * sh - tz * ch
     drop = LINK * (down[..., None] * cos[..., 1:] - tx[..., None] * sin[..., 1:])
     knee = hip + drop[..., 0]
-    foot = knee + drop[..., 1] - 0.002 * (tx * cos[..., 2] + down * sin[..., 2])
-    calf_end = knee + 0.8 * (foot - knee)  # the shin's capsule ends above the foot
+    ahead = tx * cos[..., 2] + down * sin[..., 2]
+    foot = knee + drop[..., 1] - 0.002 * ahead
+    calf_end = knee + CALF_END[1] / LINK * drop[..., 1] + CALF_END[0] * ahead
     trunk = TRUNK_POINTS.to(x)
     return {
         "foot": foot - FOOT_RADIUS,
         "thigh": torch.minimum(hip, knee) - 0.017,
         "calf": torch.minimum(knee, calf_end) - 0.012,
-        "hip": hip - 0.046,
+        "hip": height[:, None] + root + HIP_CENTRE / HIP_LENGTH * out * lean - 0.046,
         "trunk": (height[:, None] + turn @ trunk[:, :3].T - trunk[:, 3]).amin(1),
     }

@@ -16,6 +16,7 @@ FOOT_HOLD = 1.0  # s
 HAND_REACH = 3.0  # s after the last entry of the hand mode that led to it
 HAND_HOLD = 3.0  # s
 FLIP_FROM, FLIP_TO = -math.radians(60), math.radians(60)
+UPSIDE_DOWN = math.radians(150)  # beyond, the robot went over backwards
 
 
 @dataclass(frozen=True)
@@ -71,25 +72,25 @@ def _flipped(angle: Tensor, clean: Tensor) -> bool:
     """Whether the pitch passes from below -60 to above +60 degrees over 0, clean all the way."""
     armed = False
     for value, ok in zip(angle.tolist(), clean.tolist(), strict=True):
-        if value <= FLIP_FROM and value > -math.radians(150):
-            armed = True
-        if not ok:
+        if not ok or abs(value) > UPSIDE_DOWN:
             armed = False
-        if armed and value >= FLIP_TO:
-            return value < math.radians(150)
+        elif value <= FLIP_FROM:
+            armed = True
+        elif armed and value >= FLIP_TO:
+            return True
     return False
 
 
 def _reached(held: Tensor, in_hand: Tensor, dt: float) -> bool:
     """Whether some entry into the hand mode is followed by a hold of 3 s that begins within 3 s."""
     entered = in_hand & ~torch.cat([in_hand.new_zeros(1), in_hand[:-1]])
-    need = round(HAND_HOLD / dt)
+    need, reach = round(HAND_HOLD / dt), round(HAND_REACH / dt)
     for entry in entered.nonzero().flatten().tolist():
         run = 0
         for step in range(entry, len(held)):
             run = run + 1 if held[step] else 0
             if run > need:
                 return True
-            if run == 0 and (step - entry) * dt > HAND_REACH:
+            if run == 0 and step - entry >= reach:
                 break
     return False
