@@ -24,8 +24,10 @@ def write_random_policy(path: Path, hidden: tuple[int, ...] = HIDDEN, seed: int 
     sizes = [OBS_SIZE, *hidden, 12]
     for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
         w = rng.uniform(-1, 1, (n_out, n_in)).astype(np.float32) / np.sqrt(n_in).astype(np.float32)
-        weights += [numpy_helper.from_array(w, f"w{layer}"),
-                    numpy_helper.from_array(np.zeros(n_out, np.float32), f"b{layer}")]
+        weights += [
+            numpy_helper.from_array(w, f"w{layer}"),
+            numpy_helper.from_array(np.zeros(n_out, np.float32), f"b{layer}"),
+        ]
         out = "actions" if layer == len(hidden) else f"linear{layer}"
         nodes.append(helper.make_node("Gemm", [last, f"w{layer}", f"b{layer}"], [out], transB=1))
         if layer < len(hidden):  # swish
@@ -33,7 +35,8 @@ def write_random_policy(path: Path, hidden: tuple[int, ...] = HIDDEN, seed: int 
             nodes.append(helper.make_node("Mul", [out, f"gate{layer}"], [f"hidden{layer}"]))
         last = f"hidden{layer}"
     graph = helper.make_graph(
-        nodes, "policy",
+        nodes,
+        "policy",
         [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["batch", OBS_SIZE])],
         [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["batch", 12])],
         weights,

@@ -1,0 +1,93 @@
+"""Benchmarks in a tiny setting: the figures have their names, are finite, and reach the file whole."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from tools.bench import main
+from tools.benchmarks.engine import Engine
+from tools.benchmarks.figures import Common, Figures
+from tools.benchmarks.planner import Planner
+from tools.benchmarks.train import Train
+from tools.random_policy import write_random_policy
+
+SMALL = {
+    "engine": (
+        Engine(threads=1, worlds=4, steps=2, repeats=2),
+        {
+            "open_loop_efficiency",
+            "open_loop_steps_per_s",
+            "open_loop_bare_steps_per_s",
+            "open_loop_us_per_step",
+            "policy_efficiency",
+            "policy_steps_per_s",
+            "evaluator_efficiency",
+        },
+    ),
+    "train": (
+        Train(
+            threads=1,
+            warm_up=1,
+            iterations=2,
+            set=("env.worlds=8", "ppo.steps=4", "ppo.hidden=[16]", "ppo.minibatches=2"),
+        ),
+        {"train_steps_per_s", "collect_share", "physics_share", "learn_share"},
+    ),
+    "planner": (
+        Planner(threads=1, horizon=6, draws=40, samples=16, ticks=1),
+        {"plan_overhead_us", "candidates_per_s", "control_steps_fraction"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args, expected = SMALL[name]
+    out = tmp_path / "new" / "figures.json"
+    if name == "planner":  # with policies that have learned nothing, so that the Go2's part runs everywhere
+        policy = write_random_policy(tmp_path / "random.onnx", hidden=(8,))
+        names = (
+            f'task.foot="{policy}"',
+            f'task.hand="{policy}"',
+            "task.horizon=8",
+            "search.control_steps=16",
+        )
+        small = ("task.jump.mppi.samples=2", "task.jump.mppi.horizon=10", "task.jump.mppi.worlds=4")
+        args = Planner(**{**vars(args), "set": names + small})
+        expected = expected | {"go2_tick_ms_p50", "go2_tick_ms_p99", "go2_control_steps_fraction"}
+
+    assert main(type(args)(**{**vars(args), "json": out})) == 0
+
+    written = json.loads(out.read_text())
+    assert expected <= set(written)
+    figures = {key: value for key, value in written.items() if isinstance(value, float)}
+    assert all(math.isfinite(value) and value > 0 for value in figures.values()), figures
+    assert {"cpu", "cores", "threads", "torch", "mujoco"} <= set(written["machine"])
+    assert [path.name for path in out.parent.iterdir()] == ["figures.json"]
+    assert f"bench {name}" in capsys.readouterr().out
+
+
+def test_a_share_of_the_time_is_a_share(tmp_path: Path) -> None:
+    out = tmp_path / "figures.json"
+    args, _ = SMALL["train"]
+    main(Train(**{**vars(args), "json": out}))
+    found = json.loads(out.read_text())
+    assert found["physics_share"] <= found["collect_share"]
+    assert found["collect_share"] + found["learn_share"] <= 1.0
+
+
+def test_targets_are_printed_as_met_or_not() -> None:
+    figures = Figures()
+    figures.add("policy_efficiency", 0.81, "of which [us]")
+    figures.add("open_loop_efficiency", 0.5, "")
+    cells = [list(column.cells) for column in figures.table("bench").columns]
+    assert ["not met" in text for text in cells[2]] == [False, True]
+    assert "us" in cells[3][0]
+
+
+def test_threads_default_to_all_cores() -> None:
+    assert Common().threads == 0

@@ -1,0 +1,86 @@
+"""Figures by name, and the machine that they were taken on."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import onnxruntime
+import torch
+from rich.markup import escape
+from rich.table import Table
+
+# What the project asks of itself: figure -> at least this much.
+TARGETS = {"open_loop_efficiency": 0.95, "policy_efficiency": 0.80, "train_steps_per_s": 6000.0}
+
+
+@dataclass(frozen=True)
+class Common:
+    """What all measurements take.
+
+    Attributes:
+        json: file to write the figures to.
+        threads: of the engine, of torch and of onnxruntime; 0 for all cores.
+    """
+
+    json: Path | None = None
+    threads: int = 0
+
+
+@dataclass
+class Figures:
+    """Figures by name, each with the words that explain it in the table."""
+
+    values: dict[str, float] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def add(self, name: str, value: float, note: str) -> None:
+        """Take down one figure."""
+        self.values[name], self.notes[name] = float(value), note
+
+    def table(self, title: str) -> Table:
+        """A row a figure, with its target where there is one."""
+        view = Table(title=title)
+        view.add_column("figure")
+        view.add_column("value", justify="right")
+        view.add_column("target")
+        view.add_column("what")
+        for name, value in self.values.items():
+            target, digits = "", 3 if abs(value) < 10 else 0
+            if name in TARGETS:
+                met = "[green]met[/]" if value >= TARGETS[name] else "[red]not met[/]"
+                target = f">= {TARGETS[name]:,g}  {met}"
+            view.add_row(name, f"{value:,.{digits}f}", target, escape(self.notes[name]))
+        return view
+
+
+def machine(threads: int) -> dict[str, str | int | float]:
+    """What the figures were taken on."""
+    model = platform.processor() or "unknown"
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
+        ]
+        model = names[0] if names else model
+    return {
+        "cpu": model,
+        "cores": os.cpu_count() or 1,
+        "cores_allowed": cores(),
+        "threads": threads,
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else -1.0,
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "mujoco": mujoco.__version__,
+        "numpy": np.__version__,
+        "onnxruntime": onnxruntime.__version__,
+    }
+
+
+def cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
