@@ -176,7 +176,9 @@ def clearances(x: Tensor) -> dict[str, Tensor]:
     cos, sin = angle.cos(), angle.sin()
     tx, ty, tz = turn[:, :, None].unbind(1)
     ch, sh = cos[..., 0], sin[..., 0]
-    root, out = turn[:, :2] @ _hips(x.dtype, x.device), HIP_LENGTH * _sides(x.dtype, x.device)[0]
+    # entry by entry: a matrix product may round differently in a batch of another size
+    forward, sideways = _hips(x.dtype, x.device)
+    root, out = tx * forward + ty * sideways, HIP_LENGTH * _sides(x.dtype, x.device)[0]
     lean = ty * ch + tz * sh
     hip = height[:, None] + root + out * lean
     down = ty * sh - tz * ch
@@ -185,11 +187,11 @@ def clearances(x: Tensor) -> dict[str, Tensor]:
     ahead = tx * cos[..., 2] + down * sin[..., 2]
     foot = knee + drop[..., 1] - 0.002 * ahead
     calf_end = knee + CALF_END[1] / LINK * drop[..., 1] + CALF_END[0] * ahead
-    trunk = TRUNK_POINTS.to(x)
+    px, py, pz, radius = TRUNK_POINTS.to(x).unbind(1)
     return {
         "foot": foot - FOOT_RADIUS,
         "thigh": torch.minimum(hip, knee) - 0.017,
         "calf": torch.minimum(knee, calf_end) - 0.012,
         "hip": height[:, None] + root + HIP_CENTRE / HIP_LENGTH * out * lean - 0.046,
-        "trunk": (height[:, None] + turn @ trunk[:, :3].T - trunk[:, 3]).amin(1),
+        "trunk": (height[:, None] + tx * px + ty * py + tz * pz - radius).amin(1),
     }
