@@ -84,7 +84,7 @@ def test_targets_are_printed_as_met_or_not() -> None:
     figures = Figures()
     figures.add("policy_efficiency", 0.81, "of which [us]")
     figures.add("open_loop_efficiency", 0.5, "")
-    cells = [list(column.cells) for column in figures.table("bench").columns]
+    cells = [[str(cell) for cell in column.cells] for column in figures.table("bench").columns]
     assert ["not met" in text for text in cells[2]] == [False, True]
     assert "us" in cells[3][0]
 

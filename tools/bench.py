@@ -49,4 +49,4 @@ def main(args: Engine | Train | Planner) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Engine | Train | Planner)))  # type: ignore[call-overload]
+    sys.exit(main(tyro.cli(Engine | Train | Planner)))

@@ -44,6 +44,7 @@ class Runner(OnPolicyRunner):
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             super().__init__(env, cfg, log_dir, device)
         self.meta = meta
+        self._fuse()
         self.last_iteration = self.updates = 0
         self.logger.git_status_repos.clear()  # it looks for its own repository and says that there is none
         self.table = LiveTable(self)
@@ -95,6 +96,7 @@ class Runner(OnPolicyRunner):
                 f"checkpoint {path}: its networks do not fit this configuration, whose hidden layers are "
                 f"{self.cfg['actor']['hidden_dims']}: set ppo.hidden as it was trained with"
             ) from error
+        self._fuse()
         infos = data["infos"]
         self.current_learning_iteration += 1
         self.logger.tot_timesteps, self.logger.tot_time = infos["steps"], infos["seconds"]
@@ -107,6 +109,11 @@ class Runner(OnPolicyRunner):
         random.setstate(rng["python"])
         if "cuda" in rng and self.device.startswith("cuda"):
             torch.cuda.set_rng_state(rng["cuda"].cpu(), self.device)
+
+    def _fuse(self) -> None:
+        """Let the optimiser update all of its parameters in one pass: a third of the time on a CPU."""
+        for group in self.alg.optimizer.param_groups:
+            group["fused"] = True
 
     def _log_quietly(self, **kwargs: Any) -> None:
         self.updates += 1

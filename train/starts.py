@@ -150,7 +150,7 @@ class Starts:
         self.rates.copy_(state["rates"])
 
     def _uniform(self, shape: int | tuple[int, ...], low: float, high: float) -> Tensor:
-        return torch.rand(shape, device=self.device) * (high - low) + low
+        return torch.empty(shape, device=self.device).uniform_(low, high)
 
     def _place(self, place: Tensor, energy: Tensor, hop: Tensor) -> Tensor:
         r"""States on the line from this stance (place 1) over horizontal (0) to the other one (-1).
