@@ -69,7 +69,7 @@ def export(checkpoint: Path, out: Path) -> None:
     meta = data["infos"]["meta"]
     config = portable(json.loads(meta["config"]))
     stance = STANCES[config["env"]["mode"]]
-    module = _Deterministic(actor_of(data))
+    module = _Deterministic(actor_of(data)).eval()
     partial = out.with_suffix(".partial.onnx")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
     with redirect_stdout(io.StringIO()), warnings.catch_warnings():

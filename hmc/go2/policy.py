@@ -62,9 +62,8 @@ class Policy(Mode):
             )
         except Exception as error:
             raise ValueError(f"policy {self.path}: not a readable ONNX file ({error})") from error
-        self.metadata = {
-            key: json.loads(value) for key, value in self._session.get_modelmeta().custom_metadata_map.items()
-        }
+        fields = self._session.get_modelmeta().custom_metadata_map
+        self.metadata = {key: _decoded(text) for key, text in fields.items()}
         self._check()
         self.name = name or str(self.metadata["mode"])
         pose = torch.tensor(self.metadata["default_pose"], dtype=torch.float64)
@@ -99,3 +98,11 @@ class Policy(Mode):
                 raise ValueError(
                     f"policy {self.path}: its metadata lacks {field!r}: export it with train/export.py"
                 )
+
+
+def _decoded(text: str) -> Any:
+    """A metadata value: JSON as we write it, else the text that another program wrote."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text

@@ -1,0 +1,229 @@
+"""Policy files: what they must agree with, and that they do what the trained network does."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import resources
+from pathlib import Path
+
+import onnx
+import pytest
+import torch
+from tensordict import TensorDict
+
+from hmc.go2 import model as go2
+from hmc.go2.observe import OBS_SIZE, anchor_of, observe
+from hmc.go2.policy import Policy, contract
+from hmc.go2.stances import HANDSTAND, STANCES
+from tests.tiny import CFG, make_runner
+from train.config import ROOT, config_hash, portable
+from train.export import actor_of, export
+from train.runner import read_checkpoint
+
+COMMITTED = sorted(Path(str(resources.files("hmc.go2"))).glob("policies/*.onnx"))
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> Path:
+    """A checkpoint of an untrained network whose normaliser has seen something."""
+    torch.manual_seed(1)
+    folder = tmp_path_factory.mktemp("run")
+    argv = (
+        "--mode",
+        "handstand",
+        "--out",
+        str(folder),
+        f"--checkpoint={ROOT}/out/a.pt",
+        "--set",
+        "ppo.lam=0.9",
+    )
+    runner = make_runner(folder, argv=argv)
+    groups = {"policy": 3 * torch.randn(500, OBS_SIZE) + 1, "critic": torch.randn(500, OBS_SIZE + 13)}
+    runner.alg.actor.update_normalization(TensorDict(groups, batch_size=[500]))
+    runner.save(str(folder / "model_0.pt"))
+    return folder / "model_0.pt"
+
+
+@pytest.fixture(scope="module")
+def exported(checkpoint) -> Path:
+    path = checkpoint.with_name("policy.onnx")
+    export(checkpoint, path)
+    return path
+
+
+def observations(n: int) -> torch.Tensor:
+    return 3 * torch.randn(n, OBS_SIZE) + 1
+
+
+def run(policy: Policy, obs: torch.Tensor) -> torch.Tensor:
+    """The network's own output (n, 12)."""
+    return torch.from_numpy(policy._session.run(None, {"obs": obs.numpy()})[0])
+
+
+def edited(path: Path, out: Path, key: str, value: object) -> Path:
+    """A copy of a policy file with one field of its metadata changed, or taken out (None)."""
+    model = onnx.load(str(path))
+    fields = {prop.key: prop.value for prop in model.metadata_props if prop.key != key}
+    if value is not None:
+        fields[key] = json.dumps(value)
+    del model.metadata_props[:]
+    for name, text in fields.items():
+        model.metadata_props.add(key=name, value=text)
+    onnx.save(model, str(out))
+    return out
+
+
+@torch.no_grad()
+def test_the_file_does_what_the_network_does(checkpoint, exported):
+    obs = observations(1000)
+    torch_actions = actor_of(read_checkpoint(checkpoint))(TensorDict({"policy": obs}, batch_size=[1000]))
+    torch.testing.assert_close(run(Policy(exported), obs), torch_actions, atol=1e-5, rtol=0)
+    assert torch_actions.std(0).min() > 1e-3
+
+
+def test_the_same_bits_in_a_batch_of_any_size(exported):
+    policy, obs = Policy(exported), observations(64)
+    whole = run(policy, obs)
+    for n in range(1, 65):
+        assert torch.equal(run(policy, obs[:n]), whole[:n])
+        assert torch.equal(run(policy, obs[-n:]), whole[-n:])
+    assert torch.equal(run(Policy(exported, threads=2), obs), whole)
+
+
+def test_the_mode(exported):
+    """Target = pose + scale x network(observation since the anchor), inside the joint limits."""
+    policy = Policy(exported)
+    assert (policy.name, policy.memory_size) == ("handstand", 4)
+    assert Policy(exported, name="hand").name == "hand"
+    x = HANDSTAND.state().repeat(3, 1)
+    x[:, :2] = torch.randn(3, 2)
+    u, k = torch.randn(3, 12).double(), torch.zeros(3, dtype=torch.long)
+    memory = policy.reset(x, u, k)
+    assert torch.equal(memory, anchor_of(x))
+    x[:, 0] += 0.5
+    action, after = policy.act(x, u, memory, k)
+    network = run(policy, observe(x, u, memory).float()).double()
+    expected = HANDSTAND.pose + CFG.env.action_scale * network
+    torch.testing.assert_close(
+        action, expected.clamp(go2.Q_LOWER.double(), go2.Q_UPPER.double()), atol=1e-6, rtol=0
+    )
+    assert torch.equal(after, memory)
+    action, _ = policy.act(1e4 * x, u, memory, k)
+    assert ((action >= go2.Q_LOWER) & (action <= go2.Q_UPPER)).all()
+
+
+def test_metadata(exported, checkpoint):
+    meta = Policy(exported).metadata
+    assert {key: meta[key] for key in contract()} == contract()
+    assert meta["mode"] == "handstand"
+    assert meta["default_pose"] == pytest.approx(HANDSTAND.pose.tolist(), abs=1e-6)
+    assert meta["action_scale"] == 0.5
+    assert meta["training_seed"] == 7
+    assert meta["training_command"].split() == [
+        *("python", "train/ppo.py", "--mode", "handstand", "--out", checkpoint.parent.name),
+        *("--checkpoint=out/a.pt", "--set", "ppo.lam=0.9"),
+    ]
+    assert meta["training_config"]["ppo"]["hidden"] == [16, 8]
+    assert meta["training_config_sha256"] == config_hash(meta["training_config"])
+    assert len(meta["training_config_sha256"]) == 64
+
+
+def test_paths_in_metadata_are_portable():
+    assert portable(f"{ROOT}/out/flips.pt") == "out/flips.pt"
+    assert portable("env.starts.records=/somewhere/else/flips.pt") == "env.starts.records=flips.pt"
+    assert portable(["--out", "/tmp/x", "out/y", 3, {"records": "/a/b.pt"}]) == [
+        "--out",
+        "x",
+        "out/y",
+        3,
+        {"records": "b.pt"},
+    ]
+    assert portable("ppo.hidden=[64, 32]") == "ppo.hidden=[64, 32]"
+
+
+WRONG = {
+    "observation_version": 2,
+    "observation_size": 45,
+    "joint_order": [*go2.JOINTS[3:6], *go2.JOINTS[:3], *go2.JOINTS[6:]],
+    "kp": 40.0,
+    "kd": 1.0,
+    "control_dt": 0.01,
+}
+
+
+def test_every_field_of_the_contract_is_tried():
+    assert set(WRONG) == set(contract())
+
+
+@pytest.mark.parametrize("field", WRONG)
+def test_a_wrong_field_is_named(exported, tmp_path, field):
+    other = edited(exported, tmp_path / "other.onnx", field, WRONG[field])
+    with pytest.raises(ValueError, match="other version") as error:
+        Policy(other)
+    for part in (
+        str(other),
+        f"{field} is {WRONG[field]!r}",
+        f"expected {contract()[field]!r}",
+        "train and export",
+    ):
+        assert part in str(error.value)
+
+
+@pytest.mark.parametrize("field", [*WRONG, "mode", "default_pose", "action_scale"])
+def test_a_missing_field_is_named(exported, tmp_path, field):
+    other = edited(exported, tmp_path / "other.onnx", field, None)
+    with pytest.raises(ValueError, match=f"metadata lacks {field!r}.*train/export.py"):
+        Policy(other)
+
+
+def test_metadata_that_is_not_ours(exported, tmp_path):
+    """Another program's file: free text in its metadata, or none."""
+    model = onnx.load(str(exported))
+    del model.metadata_props[:]
+    onnx.save(model, str(tmp_path / "bare.onnx"))
+    with pytest.raises(ValueError, match="metadata lacks 'observation_version'"):
+        Policy(tmp_path / "bare.onnx")
+    model.metadata_props.add(key="author", value="not JSON")
+    onnx.save(model, str(tmp_path / "other.onnx"))
+    with pytest.raises(ValueError, match="metadata lacks 'observation_version'"):
+        Policy(tmp_path / "other.onnx")
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(ValueError, match=r"nothing\.onnx: no such file"):
+        Policy(tmp_path / "nothing.onnx")
+
+
+@pytest.mark.parametrize("keep", [0, 100, 0.5])
+def test_a_truncated_file(exported, tmp_path, keep):
+    data = exported.read_bytes()
+    short = tmp_path / "short.onnx"
+    short.write_bytes(data[: int(keep * len(data)) if keep < 1 else keep])
+    with pytest.raises(ValueError, match=r"short\.onnx: (not a readable ONNX file|its metadata lacks)"):
+        Policy(short)
+
+
+def test_export_leaves_nothing_half_done(checkpoint, tmp_path):
+    short = tmp_path / "short.pt"
+    short.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"short\.pt: cannot be read"):
+        export(short, tmp_path / "policy.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["short.pt"]
+
+
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)
+def test_committed_policies(path):
+    policy = Policy(path)
+    meta, stance = policy.metadata, STANCES[path.stem]
+    assert meta["mode"] == path.stem
+    assert meta["default_pose"] == pytest.approx(stance.pose.tolist(), abs=1e-6)
+    assert meta["training_command"].startswith("python train/ppo.py ")
+    assert f"--mode {path.stem}" in meta["training_command"]
+    assert isinstance(meta["training_seed"], int)
+    assert meta["training_config_sha256"] == config_hash(meta["training_config"])
+    assert not re.search(r"(^|[\s=\"'])(/|[A-Z]:\\)\w", json.dumps(meta)), "a path of somebody's machine"
+    x = stance.state()[None]
+    k = torch.zeros(1, dtype=torch.long)
+    action, _ = policy.act(x, x[:, 7:19], policy.reset(x, x[:, 7:19], k), k)
+    assert action.isfinite().all()

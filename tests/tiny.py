@@ -1,0 +1,28 @@
+"""A training run small enough for a test: eight worlds, two small layers, a few steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hmc.go2.model import load_model
+from hmc.sim.mujoco import MujocoSim
+from train.config import PpoCfg, TrainCfg, metadata, rsl_config
+from train.env import EnvCfg, StanceEnv
+from train.runner import Runner
+from train.starts import StartsCfg
+
+STARTS = StartsCfg(stance=0.5, way=0.3, home=0.2, furthest=-1.0)
+CFG = TrainCfg(
+    env=EnvCfg(mode="handstand", worlds=8, episode_steps=20, starts=STARTS),
+    ppo=PpoCfg(iterations=2, steps=6, epochs=1, minibatches=2, hidden=(16, 8)),
+)
+
+
+def make_env(cfg: EnvCfg = CFG.env) -> StanceEnv:
+    """The environment on the C engine, one thread."""
+    return StanceEnv(cfg, MujocoSim(load_model(), cfg.worlds, threads=1))
+
+
+def make_runner(folder: Path, cfg: TrainCfg = CFG, argv: tuple[str, ...] = (), seed: int = 7) -> Runner:
+    """A runner that has not learned yet and writes into `folder`."""
+    return Runner(make_env(cfg.env), rsl_config(cfg.ppo), str(folder), "cpu", metadata(cfg, argv, seed))
