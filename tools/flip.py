@@ -306,6 +306,8 @@ def main(args: Args) -> int:
             ) -> None:
                 note = f"{entry['mode']:>5}  pitch {np.degrees(angle):+4.0f}  height {height:.2f} m"
                 bar.update(job, completed=done, total=total, note=note)
+                if not console.is_terminal and done % 50 == 0:
+                    console.print(f"seed {seed}: step {done} of {total}, {note}", highlight=False)
 
             task = flip_task(cfg.task, seed=seed, threads=args.threads)
             runs.append(run(cfg, task, seed, show))
