@@ -1,0 +1,163 @@
+"""The flip's cost term by term at states computed by hand, its timeline, its modes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from hmc.go2 import model as go2
+from hmc.go2.stances import FOOTSTAND, HANDSTAND
+from hmc.go2.task import (
+    CostCfg,
+    FlipCfg,
+    JumpCfg,
+    dense_guess,
+    flip_task,
+    jump_mode,
+    make_sim,
+    stance_cost,
+    timeline,
+)
+from tools.random_policy import write_random_policy
+
+COMMAND = 60
+CFG = CostCfg()
+COST = stance_cost(CFG, timeline(COMMAND))
+
+
+def stage(x, u=None, u_prev=None, k=COMMAND) -> dict[str, float]:
+    """Stage terms of one state."""
+    u = x[7:19] if u is None else u
+    u_prev = u if u_prev is None else u_prev
+    terms = COST.stage_terms(x[None], u[None], u_prev[None], torch.tensor([k]))[0]
+    return dict(zip(COST.stage, terms.tolist(), strict=True))
+
+
+def terminal(x, k) -> float:
+    return float(COST.terminal_terms(x[None], torch.tensor([k]))[0, 0])
+
+
+def test_terms_and_weights():
+    """Table I of the paper."""
+    assert list(COST.stage) == ["height", "orientation", "joints", "rate", "energy", "pose"]
+    assert list(COST.terminal) == ["tail"]
+    assert (CFG.height, CFG.orientation, CFG.joints, CFG.rate) == (1.5, 1.0, 0.5, 0.001)
+    assert (CFG.energy, CFG.pose) == (0.003, 2.5e-7)
+    assert COST.nonnegative
+
+
+@pytest.mark.parametrize(("stance", "k"), [(FOOTSTAND, COMMAND - 1), (HANDSTAND, COMMAND)])
+def test_nothing_but_the_pose_term_is_left_at_the_target(stance, k):
+    terms = stage(stance.state(), k=k)
+    away = float((stance.pose - go2.HOME).square().sum())
+    assert terms.pop("pose") == pytest.approx(2.5e-7 * math.exp(-away), rel=1e-5)
+    assert all(value == pytest.approx(0, abs=1e-12) for value in terms.values())
+    assert terminal(stance.state(), k) == pytest.approx(0, abs=1e-12)
+
+
+def test_the_target_changes_at_the_command():
+    apart = float((FOOTSTAND.pose - HANDSTAND.pose).square().sum())
+    for x, k in [(FOOTSTAND.state(), COMMAND), (HANDSTAND.state(), COMMAND - 1)]:
+        terms = stage(x, k=k)
+        assert terms["orientation"] == pytest.approx(4.0), "gravity along -x instead of +x: 2^2"
+        assert terms["joints"] == pytest.approx(0.5 * apart)
+        assert terms["height"] == pytest.approx(0, abs=1e-12)
+        assert terminal(x, k) == pytest.approx(4.0 + 0.5 * apart)
+    k = torch.tensor([0, COMMAND - 1, COMMAND, 10_000])
+    assert timeline(COMMAND)(k).tolist() == [False, False, True, True]
+
+
+def test_each_term_by_hand():
+    x = HANDSTAND.state()
+    x[2] -= 0.2
+    x[7] += 0.1
+    x[25], x[30] = 2.0, -4.0
+    u = x[7:19].clone()
+    u_prev = u.clone()
+    u_prev[3:6] -= 0.2
+    terms = stage(x, u, u_prev)
+    assert terms["height"] == pytest.approx(1.5 * 0.04)
+    assert terms["joints"] == pytest.approx(0.5 * 0.01)
+    assert terms["rate"] == pytest.approx(0.001 * 3 * 0.04)
+    # damping alone: torques -0.5 x 2 and -0.5 x -4, powers -2 and -8
+    assert terms["energy"] == pytest.approx(0.003 * math.sqrt(4 + 64))
+    assert terms["orientation"] == pytest.approx(0, abs=1e-12)
+    assert terminal(x, COMMAND) == pytest.approx(1.5 * 0.04 + 0.5 * 0.01)
+
+
+def test_orientation_by_hand():
+    """On four legs gravity has no part along the body's x and y: distance 1 from either target."""
+    x = torch.zeros(37, dtype=torch.float64)
+    x[2], x[3], x[7:19] = 0.29, 1.0, go2.HOME
+    for k in (0, COMMAND):
+        assert stage(x, k=k)["orientation"] == pytest.approx(1.0)
+        assert stage(x, k=k)["pose"] == pytest.approx(2.5e-7), "the default pose, where the term is largest"
+    x[3], x[4] = math.cos(0.25), math.sin(0.25)  # rolled by 0.5 rad: gravity's y is -sin 0.5
+    assert stage(x)["orientation"] == pytest.approx(1.0 + math.sin(0.5) ** 2)
+
+
+def test_no_term_is_ever_negative():
+    """What pruning rests on."""
+    n = 500
+    x, u, u_prev = (
+        5 * torch.randn(n, 37).double(),
+        5 * torch.randn(n, 12).double(),
+        torch.randn(n, 12).double(),
+    )
+    x[:, 3:7] /= x[:, 3:7].norm(dim=1, keepdim=True)
+    k = torch.randint(0, 2 * COMMAND, (n,))
+    assert (COST.stage_terms(x, u, u_prev, k) >= 0).all()
+    assert (COST.terminal_terms(x, k) >= 0).all()
+
+
+def test_tail():
+    """The last state held for that long, and weightless where it is 0."""
+    x = FOOTSTAND.state()
+    k = torch.tensor([COMMAND])
+    once = stance_cost(CostCfg(tail=1.0), timeline(COMMAND)).terminal_terms(x[None], k)
+    double = stance_cost(CostCfg(tail=2.0), timeline(COMMAND)).terminal_terms(x[None], k)
+    torch.testing.assert_close(double, 2 * once)
+    assert not stance_cost(CostCfg(tail=0.0), timeline(COMMAND)).terminal_terms(x[None], k).any()
+
+
+def test_one_row_or_many_is_the_same_to_the_bit():
+    x, u = torch.randn(2, 40, 37, dtype=torch.float64)
+    u, k = u[:, :12], torch.arange(40) + 40
+    whole, last = COST.stage_terms(x, u, -u, k), COST.terminal_terms(x, k)
+    for row in range(40):
+        one = slice(row, row + 1)
+        assert torch.equal(COST.stage_terms(x[one], u[one], -u[one], k[one]), whole[one])
+        assert torch.equal(COST.terminal_terms(x[one], k[one]), last[one])
+
+
+def test_dense_guess():
+    points = torch.tensor([[0.0, 1.0, 2.0, 3.0], [4.0, 3.0, 2.0, 1.0]], dtype=torch.float64)
+    dense = dense_guess(points, 4)
+    assert dense.shape == (5, 12)
+    assert dense[1].tolist() == [0, 1, 1.5, 0, 1, 1.5, 0, 2, 2.5, 0, 2, 2.5]
+    assert dense[4].tolist() == [0, 4, 3, 0, 4, 3, 0, 2, 1, 0, 2, 1]
+
+
+def test_jump_noise_is_mostly_symmetric():
+    jump = jump_mode(JumpCfg(asymmetry=0.0), lambda n: make_sim(n, threads=1), seed=0)
+    eps = jump._noise(torch.tensor([0]), 0)
+    assert torch.equal(eps[..., 0:3], eps[..., 3:6])
+    assert torch.equal(eps[..., 6:9], eps[..., 9:12])
+    assert not eps[..., [0, 3, 6, 9]].any(), "hips do not take part in symmetric motion"
+    assert eps[0, 1:, :, [1, 2, 7, 8]].std(0).min() > 0
+    loose = jump_mode(JumpCfg(asymmetry=0.2), lambda n: make_sim(n, threads=1), seed=0)
+    assert not torch.equal(*loose._noise(torch.tensor([0]), 0)[..., [1, 4]].unbind(-1))
+
+
+def test_the_task(tmp_path):
+    """Modes in order, and what the policies are called here; a policy that is not there is named."""
+    policy = str(write_random_policy(tmp_path / "policy.onnx", hidden=(4,)))
+    task = flip_task(FlipCfg(foot=policy, hand=policy, horizon=9), threads=1)
+    assert task.modes.names == ("foot", "jump", "hand")
+    assert task.horizon == 9
+    sim = task.make_sim(2)
+    assert (sim.num_worlds, sim.nx, sim.nu, sim.dt) == (2, 37, 12, 0.02)
+    with pytest.raises(ValueError, match=r"nothing\.onnx: no such file"):
+        flip_task(FlipCfg(foot=policy, hand=str(tmp_path / "nothing.onnx")), threads=1)
