@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import onnx
 import pytest
@@ -14,6 +15,7 @@ import torch
 from rich.console import Console
 
 from hmc.cfg import load
+from hmc.go2.stages import Stages
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import flip_task
 from tools import flip
@@ -43,7 +45,7 @@ def cfg(overrides) -> flip.RunCfg:
     return load(flip.ROOT / "cfg" / "flip.toml", flip.RunCfg, overrides)
 
 
-def one_run(cfg: flip.RunCfg, seed: int, seen: list | None = None) -> flip.Run:
+def one_run(cfg: flip.RunCfg, seed: int, seen: list[Any] | None = None) -> flip.Run:
     progress = None if seen is None else lambda *args: seen.append(args)
     return flip.run(cfg, flip_task(cfg.task, seed=seed, threads=1), seed, progress)
 
@@ -80,7 +82,7 @@ def test_the_log_is_what_happened(cfg, done):
 
 
 def test_the_same_seed_gives_the_same_run(cfg, done):
-    seen: list = []
+    seen: list[Any] = []
     again, other = one_run(cfg, 0, seen), one_run(cfg, 1)
     assert torch.equal(again.x, done.x)
     assert torch.equal(again.modes, done.modes)
@@ -154,7 +156,7 @@ def test_the_program(overrides, done, tmp_path, monkeypatch, capsys):
     assert "foot stand" in printed
     assert "plan p99" in printed
 
-    reached = flip.Stages(foot_stand=True, jump_flip=True, handstand=True)
+    reached = Stages(foot_stand=True, jump_flip=True, handstand=True)
     monkeypatch.setattr(flip, "run", lambda *_: replace(done, stages=reached))
     monkeypatch.setattr(flip, "write_run", lambda *_: None)
     assert flip.main(replace(args, seeds=1)) == 0

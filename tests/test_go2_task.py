@@ -65,8 +65,8 @@ def test_the_target_changes_at_the_command():
         assert terms["joints"] == pytest.approx(0.5 * apart)
         assert terms["height"] == pytest.approx(0, abs=1e-12)
         assert terminal(x, k) == pytest.approx(4.0 + 0.5 * apart)
-    k = torch.tensor([0, COMMAND - 1, COMMAND, 10_000])
-    assert timeline(COMMAND)(k).tolist() == [False, False, True, True]
+    steps = torch.tensor([0, COMMAND - 1, COMMAND, 10_000])
+    assert timeline(COMMAND)(steps).tolist() == [False, False, True, True]
 
 
 def test_each_term_by_hand():

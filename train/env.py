@@ -116,8 +116,9 @@ class StanceEnv(VecEnv):
         before, u_prev = self._x, self._u
         self.sim.step(u)
         x = self.sim.x().float()
-        broken = ~torch.isfinite(x).all(1)
+        broken = ~(torch.isfinite(x).all(1) & torch.isfinite(u).all(1))
         x = torch.where(broken[:, None], before, x)
+        u = torch.where(broken[:, None], u_prev, u)
         self._x, self._u = x, u
         self.episode_length_buf += 1
         gap, dt = go2.clearances(x), self.sim.dt

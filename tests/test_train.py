@@ -1,0 +1,260 @@
+"""Training: iterations run, checkpoints hold everything, and what the user gets wrong is one line."""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from hmc.cfg import load
+from hmc.cli import one_line_errors
+from tests.tiny import CFG, make_runner
+from tools.random_policy import write_random_policy
+from tools.render import EVERY, strip_steps
+from train import play, ppo
+from train.config import TrainCfg, rsl_config
+from train.runner import read_checkpoint
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Two iterations: the folder and the runner."""
+    torch.manual_seed(3)
+    folder = tmp_path_factory.mktemp("run")
+    runner = make_runner(folder)
+    before = {key: value.clone() for key, value in runner.alg.actor.state_dict().items()}
+    runner.last_iteration = 2
+    ppo.train(runner, folder)
+    return folder, runner, before
+
+
+def test_two_iterations(trained):
+    folder, runner, before = trained
+    assert runner.updates == 2
+    assert runner.logger.tot_timesteps == 2 * 6 * 8
+    after = runner.alg.actor.state_dict()
+    assert any(not torch.equal(after[key], before[key]) for key in after)
+    assert all(value.isfinite().all() for value in after.values())
+    names = {path.name for path in folder.iterdir()}
+    assert {"latest.pt", "model_0.pt", "model_1.pt"} <= names
+    assert not [name for name in names if "partial" in name]
+    assert any(name.startswith("events.out.tfevents") for name in names), "tensorboard"
+
+
+def test_a_checkpoint_says_how_it_was_made(trained):
+    folder, *_ = trained
+    infos = read_checkpoint(folder / "latest.pt")["infos"]
+    assert infos["meta"]["seed"] == "7"
+    assert json.loads(infos["meta"]["config"])["ppo"]["steps"] == 6
+    assert infos["steps"] == 96
+
+
+def test_resume_goes_on_where_it_was(trained):
+    folder, runner, _ = trained
+    runner.env.starts.success[3, 2] = 0.4
+    runner.env.starts.rates[0] = 0.7
+    runner.save(str(folder / "model_1.pt"))
+    expected = torch.rand(3), np.random.rand(), random.random()  # noqa: NPY002
+    torch.manual_seed(99)
+    other = make_runner(folder)
+    other.resume(str(folder / "latest.pt"))
+    assert other.current_learning_iteration == 2
+    assert other.logger.tot_timesteps == 96
+    assert torch.equal(other.env.starts.success, runner.env.starts.success)
+    assert torch.equal(other.env.starts.rates, runner.env.starts.rates)
+    for ours, theirs in ((other.alg.actor, runner.alg.actor), (other.alg.critic, runner.alg.critic)):
+        theirs = theirs.state_dict()
+        assert all(torch.equal(value, theirs[key]) for key, value in ours.state_dict().items())
+    drawn = torch.rand(3), np.random.rand(), random.random()  # noqa: NPY002
+    assert torch.equal(drawn[0], expected[0])
+    assert drawn[1:] == expected[1:]
+    other.last_iteration = 3
+    ppo.train(other, folder)
+    assert other.updates == 1
+    assert read_checkpoint(folder / "latest.pt")["iter"] == 2
+
+
+def test_the_same_seed_learns_the_same(tmp_path):
+    weights = []
+    for name in ("a", "b"):
+        torch.manual_seed(11)
+        runner = make_runner(tmp_path / name)
+        runner.last_iteration = 1
+        ppo.train(runner, tmp_path / name)
+        weights.append(runner.alg.actor.state_dict())
+    assert all(torch.equal(value, weights[1][key]) for key, value in weights[0].items())
+
+
+def test_nothing_left_to_do(trained, capsys):
+    folder, *_ = trained
+    runner = make_runner(folder)
+    runner.resume(str(folder / "model_1.pt"))
+    runner.last_iteration = 2
+    ppo.train(runner, folder)
+    assert "2 iterations are done already: ask for more with --iterations" in capsys.readouterr().out
+    assert runner.updates == 0
+
+
+@pytest.mark.parametrize(("steps", "done"), [(3, 0), (8, 1)])
+def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch, capsys, steps, done):
+    """What was learned so far is kept; nothing is written where that is nothing."""
+    runner = make_runner(tmp_path)
+    runner.last_iteration = 5
+    step, count = runner.env.step, iter(range(1000))
+
+    def interrupted(actions):
+        if next(count) == steps:
+            raise KeyboardInterrupt
+        return step(actions)
+
+    monkeypatch.setattr(runner.env, "step", interrupted)
+    ppo.train(runner, tmp_path)
+    assert (tmp_path / "latest.pt").exists() == bool(done)
+    assert ("go on with --resume" if done else "nothing was learned yet") in capsys.readouterr().out
+    if done:
+        other = make_runner(tmp_path)
+        other.resume(str(tmp_path / "latest.pt"))
+        assert other.current_learning_iteration == done
+
+
+def test_an_interrupted_save_leaves_the_old_file(trained, monkeypatch):
+    folder, runner, _ = trained
+    before = (folder / "latest.pt").read_bytes()
+
+    def cut_short(data, path):
+        with open(path, "wb") as file:
+            file.write(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch, "save", cut_short)
+    with pytest.raises(KeyboardInterrupt):
+        runner.save(str(folder / "model_9.pt"))
+    assert (folder / "latest.pt").read_bytes() == before
+    assert not (folder / "model_9.pt").exists()
+
+
+def test_a_checkpoint_that_cannot_be_read(trained, tmp_path):
+    folder, *_ = trained
+    with pytest.raises(ValueError, match=r"checkpoint .*gone\.pt: no such file"):
+        read_checkpoint(tmp_path / "gone.pt")
+    data = (folder / "model_1.pt").read_bytes()
+    for size in (0, 100, len(data) // 2, len(data) - 1):
+        (tmp_path / "short.pt").write_bytes(data[:size])
+        with pytest.raises(
+            ValueError, match=rf"short\.pt: cannot be read .*{size} bytes.*resume from an older"
+        ):
+            read_checkpoint(tmp_path / "short.pt")
+    torch.save({"weights": torch.zeros(3)}, tmp_path / "other.pt")
+    with pytest.raises(ValueError, match=r"other\.pt: lacks actor_state_dict, .* written by train/ppo\.py"):
+        read_checkpoint(tmp_path / "other.pt")
+
+
+def test_a_checkpoint_of_other_networks(trained, tmp_path):
+    folder, *_ = trained
+    bigger = TrainCfg(CFG.env, ppo=type(CFG.ppo)(hidden=(4,)))
+    runner = make_runner(tmp_path, bigger)
+    with pytest.raises(ValueError, match=r"do not fit .* hidden layers are \[4\]: set ppo\.hidden"):
+        runner.resume(str(folder / "model_1.pt"))
+
+
+def refused(capsys, **given) -> str:
+    """The one line with which setting up a training run ends."""
+    with pytest.raises(SystemExit) as ended:
+        ppo.main(ppo.Args("handstand", threads=1, **{"set": ("env.worlds=2",), **given}))
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
+def test_bad_input_is_one_line(capsys, tmp_path):
+    assert "unknown key env.wrlds; did you mean worlds?" in refused(capsys, set=("env.wrlds=2",))
+    assert "device cuda:63 does not exist" in refused(capsys, device="cuda:63")
+    assert "unknown device 'gpu'" in refused(capsys, device="gpu")
+    assert "latest.pt: no such file" in refused(capsys, resume=True, out=tmp_path)
+    assert "gone.pt: no such file" in refused(capsys, checkpoint=tmp_path / "gone.pt", out=tmp_path)
+    assert "gone.pt: no such file" in refused(capsys, play=tmp_path / "gone.pt", out=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_play_wants_its_own_mode(trained, capsys):
+    folder, *_ = trained
+    with pytest.raises(SystemExit):
+        ppo.main(ppo.Args("footstand", play=folder / "model_1.pt"))
+    assert "trained for handstand, not for footstand" in capsys.readouterr().err
+
+
+def test_play(trained, tmp_path, monkeypatch):
+    """An episode of the policy as it would be exported, recorded and drawn by another program."""
+    folder, *_ = trained
+    drawn = []
+
+    def draw(command, **_):
+        drawn.append(command[1:])
+        return subprocess.CompletedProcess(command, 0, "no video: OpenGL is missing here\n", "")
+
+    monkeypatch.setattr(play, "export", lambda _, out: write_random_policy(out, hidden=(4,)))
+    monkeypatch.setattr("train.play.subprocess.run", draw)
+    said = play.play(folder / "model_1.pt", "handstand", tmp_path, seconds=0.2, threads=1).splitlines()
+    assert said[0].startswith("handstand: held for ")
+    assert said[1] == "no video: OpenGL is missing here"
+    steps = json.loads((tmp_path / "play.json").read_text(encoding="utf-8"))["steps"]
+    assert len(steps) == 10
+    assert all(step["mode"] == "handstand" and len(step["x"]) == 37 for step in steps)
+    assert drawn == [[str(play.RENDER), str(tmp_path / "play.json")]]
+    assert play.RENDER.is_file()
+
+
+def test_pictures_of_a_strip():
+    flip = ["foot"] * 40 + ["jump"] * 10 + ["hand"] * 50
+    assert strip_steps(flip, 9)[0] == 40 - 6 // EVERY
+    assert len(strip_steps(flip, 9)) == 9
+    assert max(strip_steps(flip[:45], 9)) == 44
+    assert strip_steps(["handstand"] * 101, 5) == [0, 25, 50, 75, 100]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_torchrun_without_a_gpu(capsys, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert "torchrun starts one process a GPU and there is none here" in refused(capsys)
+
+
+def test_torchrun_gives_each_process_its_own_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    args = ppo.Args("handstand", seed=5)
+    assert ppo.under_torchrun(args) is args
+    for key, value in {"WORLD_SIZE": "4", "RANK": "3", "LOCAL_RANK": "1"}.items():
+        monkeypatch.setenv(key, value)
+    mine = ppo.under_torchrun(args)
+    assert (mine.device, mine.seed) == ("cuda:1", 3005)
+
+
+def test_only_the_first_process_writes(tmp_path):
+    runner = make_runner(tmp_path)
+    runner.logger.disable_logs = True
+    runner.save(str(tmp_path / "model_0.pt"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_experiment_files():
+    for mode in ("handstand", "footstand"):
+        cfg = load(ppo.ROOT / "cfg" / f"{mode}.toml", TrainCfg)
+        assert cfg.env.mode == mode
+        assert sum(
+            getattr(cfg.env.starts, kind) for kind in ("stance", "way", "home", "recorded")
+        ) == pytest.approx(1)
+        assert rsl_config(cfg.ppo)["algorithm"]["learning_rate"] == cfg.ppo.learning_rate
+
+
+def test_one_line_errors(capsys, monkeypatch):
+    with pytest.raises(SystemExit), one_line_errors():
+        raise ValueError("two\n  lines")
+    assert capsys.readouterr().err == "error: two lines\n"
+    with pytest.raises(ZeroDivisionError), one_line_errors():
+        _ = 1 / 0
+    monkeypatch.setenv("HMC_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="seen"), one_line_errors():
+        raise ValueError("seen")
