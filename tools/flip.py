@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,7 @@ from hmc import Budget, Receding, Task  # noqa: E402
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.observe import pitch  # noqa: E402
+from hmc.go2.policy import DT  # noqa: E402
 from hmc.go2.stages import Stages, judge  # noqa: E402
 from hmc.go2.stances import FOOTSTAND  # noqa: E402
 from hmc.go2.task import FlipCfg, flip_task  # noqa: E402
@@ -39,11 +43,13 @@ class SearchCfg:
     Attributes:
         samples: switches drawn a batch.
         order: of the draws, see `hmc.plan`.
-        control_steps: control steps that a tick's search may roll out.
+        draws: switches that a tick's search may draw.
+        control_steps: control steps that it may roll out.
     """
 
-    samples: int = 24
+    samples: int = 16
     order: str = "tails"
+    draws: int = 16
     control_steps: int = 8000
 
 
@@ -153,7 +159,7 @@ def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
         schedule=["foot"] * task.horizon,
         samples=cfg.search.samples,
         order=cfg.search.order,
-        budget=Budget(control_steps=cfg.search.control_steps),
+        budget=Budget(draws=cfg.search.draws, control_steps=cfg.search.control_steps),
     )
     steps = round(cfg.seconds / world.dt)
     xs, modes, log, terms = [world.x()[0]], [], [], []
@@ -186,11 +192,57 @@ def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
             }
         )
         if progress is not None:
-            progress(k + 1, steps, log[-1], float(pitch(x)[0]), float(x[0, 2]))
+            progress(k + 1, log[-1], float(pitch(x)[0]), float(x[0, 2]))
     x = torch.stack(xs)
     mode = torch.tensor(modes)
     stages = judge(x, mode, world.dt, task.modes.index("hand"))
     return Run(seed, x, mode, log, torch.stack(terms), stages)
+
+
+def _work(cfg: RunCfg, seed: int, notes: Any) -> Run:
+    """One seed in a process of its own, on one core; `notes` gets (seed, steps done, what is going on)."""
+    torch.set_num_threads(1)
+
+    def show(done: int, entry: dict[str, Any], angle: float, height: float) -> None:
+        note = f"{entry['mode']:>5}  pitch {np.degrees(angle):+4.0f}  height {height:.2f} m"
+        notes.put((seed, done, note))
+
+    return run(cfg, flip_task(cfg.task, seed=seed, threads=1), seed, show)
+
+
+def run_all(cfg: RunCfg, seeds: Sequence[int], processes: int, console: Console) -> Iterator[Run]:
+    """Run seeds side by side and show how far each is; a run comes when it ends."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn(),
+    )
+    context = multiprocessing.get_context("spawn")
+    with (
+        context.Manager() as manager,
+        Progress(*columns, console=console) as bar,
+        ProcessPoolExecutor(min(processes, len(seeds)), mp_context=context) as pool,
+    ):
+        notes = manager.Queue()
+        total = round(cfg.seconds / DT)
+        jobs = {seed: bar.add_task(f"seed {seed}", total=total, note="", start=False) for seed in seeds}
+        waiting = {pool.submit(_work, cfg, seed, notes) for seed in seeds}
+        try:
+            while waiting:
+                ended, waiting = wait(waiting, timeout=0.2)
+                while not notes.empty():
+                    seed, done, note = notes.get()
+                    bar.start_task(jobs[seed])
+                    bar.update(jobs[seed], completed=done, note=note)
+                    if not console.is_terminal and done % 50 == 0:
+                        console.print(f"seed {seed}: step {done} of {total}, {note}", highlight=False)
+                yield from (future.result() for future in ended)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
 
 
 def summarise(runs: list[Run]) -> dict[str, Any]:
@@ -269,7 +321,7 @@ class Args:
         seeds: number of runs.
         first_seed: seed of the first.
         out: folder to write to.
-        threads: of the engine; 0 for all cores.
+        processes: seeds that run at the same time, a core each; 0 for as many as there are cores.
         video: render a video of each run, if OpenGL is there.
         set: overrides of cfg/flip.toml, such as search.samples=64.
     """
@@ -277,7 +329,7 @@ class Args:
     seeds: int = 3
     first_seed: int = 0
     out: Path = ROOT / "out" / "flip"
-    threads: int = 0
+    processes: int = 0
     video: bool = True
     set: tuple[str, ...] = ()
 
@@ -289,29 +341,13 @@ def main(args: Args) -> int:
         flip_task(cfg.task)  # what is wrong with a policy file shows here
         args.out.mkdir(parents=True, exist_ok=True)
     console = Console()
-    torch.set_num_threads(args.threads or os.cpu_count() or 1)
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
     runs: list[Run] = []
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as bar, contextlib.suppress(KeyboardInterrupt):
-        for seed in range(args.first_seed, args.first_seed + args.seeds):
-            job = bar.add_task(f"seed {seed}", total=round(cfg.seconds / 0.02), note="")
-
-            def show(
-                done: int, total: int, entry: dict[str, Any], angle: float, height: float, job: Any = job
-            ) -> None:
-                note = f"{entry['mode']:>5}  pitch {np.degrees(angle):+4.0f}  height {height:.2f} m"
-                bar.update(job, completed=done, total=total, note=note)
-                if not console.is_terminal and done % 50 == 0:
-                    console.print(f"seed {seed}: step {done} of {total}, {note}", highlight=False)
-
-            task = flip_task(cfg.task, seed=seed, threads=args.threads)
-            runs.append(run(cfg, task, seed, show))
-            write_run(args.out, runs[-1], task, cfg, args.video, console)
+    with contextlib.suppress(KeyboardInterrupt):
+        for done in run_all(cfg, seeds, args.processes or os.cpu_count() or 1, console):
+            runs.append(done)
+            write_run(args.out, done, flip_task(cfg.task), cfg, args.video, console)
+    runs.sort(key=lambda done: done.seed)
     if not runs:
         console.print("stopped before the first run ended: nothing written")
         return 1
