@@ -1,4 +1,4 @@
-"""What schedules cost: rollouts in chunks of worlds, no schedule more than once."""
+"""What schedules cost: rollouts in chunks of worlds, no schedule and no common beginning more than once."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hmc.rollout import Rolled, Worlds, roll
+from hmc.branches import in_order
+from hmc.rollout import Rolled, roll
 from hmc.schedule import Schedule
 from hmc.sim.base import Sim
 from hmc.start import Start
 from hmc.task import Task
-from hmc.trace import Trace, record
+from hmc.trace import Trace, record, root
+from hmc.worlds import Worlds
 
 
 class _Known(NamedTuple):
@@ -35,16 +37,29 @@ class Evaluator:
     large a simulator. A world whose state, input or cost stops being finite costs inf, is counted, and is
     not stepped any more. Results are kept: an equal schedule is never rolled out twice.
 
+    Schedules that begin alike share the rollout of their beginning: with the one that `follow` recorded,
+    and with each other as far as they fit into the simulator together.
+
+    Args:
+        task: what to roll out.
+        sim: where; made with `task.make_sim`.
+        start: where from.
+        known: a trace from earlier evaluations; where it meets `start` bit for bit, its steps are taken over.
+
     Attributes:
+        trunk: what was recorded last.
         rollouts: schedules rolled out so far.
         diverged: schedules among them whose world stopped being finite.
         pruned: schedules among them given up because their partial cost exceeded the bound.
     """
 
-    def __init__(self, task: Task, sim: Sim, start: Start):
+    def __init__(self, task: Task, sim: Sim, start: Start, known: Trace | None = None):
         self.task, self.sim, self.start = task, sim, start
         self.rollouts = self.diverged = self.pruned = 0
         self._worlds = Worlds(task, sim)
+        self.trunk = root(self._worlds, start)
+        if known is not None and known.meets(self.trunk):
+            self.trunk = known
         self._known: dict[bytes, _Known] = {}
 
     @property
@@ -77,13 +92,28 @@ class Evaluator:
             if known is None or not known.answers(bound):
                 todo.setdefault(key, row)
         fresh, rows = list(todo), torch.tensor(list(todo.values()), dtype=torch.long)
+        if len(fresh) > self.sim.num_worlds:  # neighbours share most: let them be in one chunk
+            order = in_order(schedules[rows].cpu().numpy(), self.trunk.modes[: len(self.trunk)])
+            fresh, rows = [fresh[i] for i in order], rows[order]
         for first in range(0, len(fresh), self.sim.num_worlds):
             chunk = slice(first, first + self.sim.num_worlds)
-            rolled = roll(self._worlds, self.start, schedules[rows[chunk]], bound, stop)
+            rolled = roll(self._worlds, self.trunk, schedules[rows[chunk]], bound, stop)
             if rolled is None:
                 break
             self._learn(fresh[chunk], rolled)
         return torch.tensor([self._answer(key, bound) for key in keys], dtype=torch.float64)
+
+    @torch.no_grad()
+    def follow(self, schedule: Schedule) -> float:
+        """Cost of a schedule that is recorded, so that others are rolled out from where they part from it."""
+        self.trunk = record(self._worlds, self.trunk, schedule)
+        key = self._keys(schedule.tensor()[None])[0]
+        known = self._known.get(key)
+        if known is None or known.terms is None:
+            self.rollouts += 1
+            self.diverged += not math.isfinite(self.trunk.cost)
+            self._known[key] = _Known(self.trunk.cost, self.trunk.terms.tolist())
+        return self.trunk.cost
 
     def cost(self, schedule: Schedule) -> float:
         """Cost of one schedule."""
@@ -97,7 +127,7 @@ class Evaluator:
 
     def trace(self, schedule: Schedule) -> Trace:
         """The trajectory of one schedule; its control steps are not counted."""
-        return record(self.task, self.sim, self.start, schedule)
+        return record(Worlds(self.task, self.sim), self.trunk, schedule)
 
     def _learn(self, keys: list[bytes], rolled: Rolled) -> None:
         self.rollouts += len(keys)

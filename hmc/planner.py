@@ -17,6 +17,7 @@ from hmc.sim.base import Sim
 from hmc.solvers import ORDERS, SOLVERS, Search, run
 from hmc.start import Start, Vector, make_start
 from hmc.task import Task
+from hmc.trace import Trace
 
 Progress = Callable[["Plan"], bool | None]
 
@@ -35,11 +36,14 @@ class Plan:
         space_size: Z, how many there are.
         draws: switches evaluated in the whole search, repeats included.
         rollouts: schedules rolled out; fewer than draws, as equal ones are rolled out once.
-        control_steps: control steps rolled out, over all worlds.
+        control_steps: control steps rolled out, over all worlds and inside the modes; not compared, as
+            schedules share their beginnings only where a batch fits into the simulator.
         diverged: rollouts whose world stopped being finite; their cost is inf.
         stopped_by: "converged", "iterations", "draws", "control_steps", "seconds", "progress" or
             "interrupt"; "" while the search goes on.
         elapsed: wall-clock time [s]; not compared.
+        known: what was recorded of the incumbent last gone out from: the next plan can begin with it;
+            not compared.
     """
 
     schedule: Schedule
@@ -51,10 +55,11 @@ class Plan:
     space_size: int
     draws: int
     rollouts: int
-    control_steps: int
+    control_steps: int = field(compare=False)
     diverged: int
     stopped_by: str
     elapsed: float = field(compare=False)
+    known: Trace = field(compare=False, repr=False)
 
     @property
     def cost(self) -> float:
@@ -127,6 +132,7 @@ def plan(
     progress: Progress | None = None,
     sim: Sim | None = None,
     forget: bool = True,
+    known: Trace | None = None,
 ) -> Plan:
     """Search the mode schedules of `task` from state x, from an incumbent towards lower cost.
 
@@ -156,6 +162,8 @@ def plan(
         sim: simulator to plan in, made with `task.make_sim`; made anew if left out.
         forget: let modes drop what they kept from earlier searches. A receding loop keeps it: then what
             a budget of control steps reaches depends on the ticks before.
+        known: `Plan.known` of an earlier plan of this task, cut to where this one begins (`Trace.since`): if
+            it meets the state bit for bit, its steps are not rolled out again. The plan is the same.
 
     Raises:
         PlanInterrupted: on Ctrl-C; a KeyboardInterrupt that carries the best plan so far.
@@ -174,7 +182,7 @@ def plan(
         u, mode, memory, k, snapshot = x.u, x.mode, x.memory if x.mode is not None else None, x.k, x.snapshot
         x = x.x
     start = make_start(task, sim, x, u, mode, memory, k, snapshot)
-    meter = Meter(budget or Budget(), Evaluator(task, sim, start))
+    meter = Meter(budget or Budget(), Evaluator(task, sim, start, known))
     incumbent = _incumbent(task, start, mode, schedule)
     search = Search(meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed), order)
     if progress is not None:
@@ -219,6 +227,7 @@ def _plan(search: Search, incumbent: Schedule) -> Plan:
         diverged=evaluator.diverged,
         stopped_by=search.stopped_by or "",
         elapsed=search.meter.elapsed,
+        known=evaluator.trunk,
     )
 
 

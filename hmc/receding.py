@@ -14,6 +14,7 @@ from hmc.planner import Plan, Progress, plan
 from hmc.sim.base import Sim
 from hmc.start import Vector, make_start
 from hmc.task import Task
+from hmc.trace import Trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class Receding:
         self.mode: int | None = None
         self.memory: Tensor | None = None
         self.u: Tensor | None = None
-        self._first = True  # what modes keep between ticks is this loop's own
+        self._known: Trace | None = None
         self._plan = partial(
             plan,
             task,
@@ -100,8 +101,11 @@ class Receding:
         """
         last = self.u if u is None else u
         start = make_start(self.task, self.sim, x, last, self.mode, self.memory, self.k, snapshot)
-        result = self._plan(start, schedule=self.schedule, seed=(self.seed, self.k), forget=self._first)
-        self._first = False
+        known = None if self._known is None else self._known.since(1)
+        result = self._plan(
+            start, schedule=self.schedule, seed=(self.seed, self.k), forget=known is None, known=known
+        )
+        self._known = result.known
         action = self._run(result.schedule[0], start.x, start.u)
         self.schedule = result.schedule.shift()
         self.k += 1

@@ -50,7 +50,7 @@ class Search:
 
     def __post_init__(self) -> None:
         self.space = SwitchSpace(len(self.evaluator.task.modes), len(self.schedule))
-        self.costs.append(self.evaluator.cost(self.schedule))
+        self.costs.append(self.evaluator.follow(self.schedule))
 
     @property
     def bound(self) -> float:
@@ -63,6 +63,8 @@ class Search:
     def batches(self, order: Draws | TailsFirst | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
         """Switches of Omega in an order, N at a time: indices and costs, (n,) each; inf if not known."""
         while order.left > 0:
+            if self.meter.room(2)[0] > 1:  # one is the recording's
+                self.evaluator.follow(self.schedule)
             room, limit = self.meter.room(self.samples)
             if room <= 0:
                 self.stopped_by = limit

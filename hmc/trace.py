@@ -1,18 +1,24 @@
-"""One schedule's trajectory, recorded: for execution, figures and re-planning from any of its steps."""
+"""One schedule's trajectory, recorded: for execution, figures and planning on from any of its steps."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from hmc.rollout import Worlds, finite, stage_terms, total
 from hmc.schedule import Schedule
-from hmc.sim.base import Sim
 from hmc.start import Start
 from hmc.task import Task
+from hmc.worlds import Worlds, finite, stage_terms, total
+
+# What a situation is, a row a step: a world put there goes on bit for bit.
+SITUATION = ("x", "u", "memory", "mode", "snapshots")
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +27,7 @@ class Trace:
 
     Attributes:
         task: what was rolled out.
-        schedule: the T modes.
+        modes: of the schedule, T; those of the steps after n never ran.
         k: control step of row 0.
         x: states, (n + 1, nx).
         u: inputs, (n + 1, nu); row 0 was applied before the trace began, row i + 1 in step i.
@@ -29,12 +35,11 @@ class Trace:
         mode: that mode, (n + 1,) long; -1 in row 0 if none was running.
         snapshots: engine snapshot rows, (n + 1, ns).
         stage: stage terms of each step times dt, (n, number of stage terms).
-        terminal: terminal terms, (number of terminal terms,).
-        cost: J, inf where the world diverged.
+        terminal: terminal terms, (number of terminal terms,); NaN where the world diverged.
     """
 
     task: Task
-    schedule: Schedule
+    modes: tuple[int, ...]
     k: int
     x: Tensor
     u: Tensor
@@ -43,7 +48,33 @@ class Trace:
     snapshots: Tensor
     stage: Tensor
     terminal: Tensor
-    cost: float
+
+    def __len__(self) -> int:
+        """How many steps were recorded, n."""
+        return len(self.stage)
+
+    @property
+    def schedule(self) -> Schedule:
+        """What was rolled out."""
+        return Schedule(self.modes, self.task.modes.names)
+
+    @cached_property
+    def sums(self) -> Tensor:
+        """Stage terms summed up to each step, in a rollout's order, (n + 1, number of stage terms)."""
+        rows = np.vstack([np.zeros((1, self.stage.shape[1])), self.stage.cpu().numpy()])
+        return torch.from_numpy(np.add.accumulate(rows)).to(self.stage.device)
+
+    @cached_property
+    def terms(self) -> Tensor:
+        """Each term's share of the cost, stage terms first, (number of terms,); NaN where diverged."""
+        terms = torch.cat([self.sums[-1], self.terminal])
+        return terms if bool(terms.isfinite().all()) else torch.full_like(terms, math.nan)
+
+    @cached_property
+    def cost(self) -> float:
+        """J; inf where the world diverged."""
+        cost = float(total(self.terms[None])[0])
+        return cost if math.isfinite(cost) else math.inf
 
     def start(self, i: int, *, exact: bool = True) -> Start:
         """The situation on arrival at step i, to plan on from there.
@@ -61,42 +92,70 @@ class Trace:
             snapshot=self.snapshots[i] if exact else None,
         )
 
+    def since(self, i: int) -> Self:
+        """The rest of this trace from its step i on, as the trace of the rest of its schedule."""
+        rows = {name: getattr(self, name)[i:] for name in (*SITUATION, "stage")}
+        return type(self)(self.task, self.modes[i:], self.k + i, terminal=self.terminal, **rows)
+
+    def meets(self, other: Trace) -> bool:
+        """Whether both begin in the same situation, bit for bit."""
+        same = self.task is other.task and self.k == other.k
+        return same and all(
+            torch.equal(getattr(self, part)[0], getattr(other, part)[0]) for part in SITUATION
+        )
+
 
 @torch.no_grad()
-def record(task: Task, sim: Sim, start: Start, schedule: Schedule) -> Trace:
-    """Roll out one schedule from `start` in world 0 of `sim` and record it."""
-    worlds, zero = Worlds(task, sim), torch.zeros(1, dtype=torch.long, device=sim.device)
+def root(worlds: Worlds, start: Start) -> Trace:
+    """The trace of no steps at all from `start`, made in world 0."""
+    zero = torch.zeros(1, dtype=torch.long, device=worlds.sim.device)
     worlds.reset(start, zero)
-    arrivals, stage = [], []
-    terms = torch.zeros(1, len(task.cost.names), dtype=torch.float64, device=sim.device)
-    stages, cost = len(task.cost.stage), math.inf
-    for i, mode in enumerate([*schedule, None]):
-        x, u_prev, k = sim.x(zero), sim.u(zero), torch.full_like(zero, start.k + i)
-        arrivals.append((x, u_prev, worlds.memory[:1].clone(), worlds.mode[:1].clone(), sim.save(zero)))
+    stages, names = len(worlds.task.cost.stage), len(worlds.task.cost.names)
+    none = torch.full((names,), math.nan, dtype=torch.float64, device=worlds.sim.device)
+    situation = dict(zip(SITUATION, _situation(worlds, zero), strict=True))
+    return Trace(worlds.task, (), start.k, stage=none[None, :stages][:0], terminal=none[stages:], **situation)
+
+
+@torch.no_grad()
+def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
+    """Roll out `schedule` in world 0 from where `known` begins, and record it.
+
+    The steps in which the two schedules agree are taken over from `known`.
+    """
+    modes = tuple(schedule)
+    if modes == known.modes:
+        return known
+    task, sim = worlds.task, worlds.sim
+    pairs = zip(modes, known.modes[: len(known)], strict=False)
+    agree = next((i for i, (ours, theirs) in enumerate(pairs) if ours != theirs), min(len(modes), len(known)))
+    zero = torch.zeros(1, dtype=torch.long, device=sim.device)
+    worlds.reset(known.start(agree), zero)
+    rows = [tuple(getattr(known, part)[: agree + 1] for part in SITUATION)]
+    stage, sums = [known.stage[:agree]], known.sums[agree : agree + 1]
+    terminal = torch.full_like(known.terminal, math.nan)
+    for i in range(agree, len(modes) + 1):
+        x, u_prev, k = rows[-1][0][-1:], rows[-1][1][-1:], torch.full_like(zero, known.k + i)
         if not finite(x).all():
             break
-        if mode is None:
-            terms[:, stages:] = task.cost.terminal_terms(x, k).to(torch.float64)
-            cost = float(total(terms)[0])
+        if i == len(modes):
+            terminal = task.cost.terminal_terms(x, k).to(torch.float64)[0]
             break
-        u = worlds.act(zero, torch.full_like(zero, mode), x, u_prev, k)
-        step_terms = stage_terms(task, x, u, u_prev, k, sim.dt)
-        terms[:, :stages] += step_terms
-        if not (finite(u) & finite(terms)).all():
+        u = worlds.act(zero, torch.full_like(zero, modes[i]), x, u_prev, k)
+        terms = stage_terms(task, x, u, u_prev, k, sim.dt)
+        sums = sums + terms
+        if not (finite(u) & finite(sums)).all():
             break
-        stage.append(step_terms)
+        stage.append(terms)
         sim.step(u, zero)
-    x, u, memory, modes, snapshots = (torch.cat(rows) for rows in zip(*arrivals, strict=True))
-    return Trace(
-        task=task,
-        schedule=schedule,
-        k=start.k,
-        x=x,
-        u=u,
-        memory=memory,
-        mode=modes,
-        snapshots=snapshots,
-        stage=torch.cat([*stage, terms[:0, :stages]]),
-        terminal=terms[0, stages:],
-        cost=cost if math.isfinite(cost) else math.inf,
-    )
+        worlds.control_steps += 1
+        rows.append(_situation(worlds, zero))
+    situation = {
+        part: torch.cat(column) for part, column in zip(SITUATION, zip(*rows, strict=True), strict=True)
+    }
+    return Trace(task, modes, known.k, stage=torch.cat(stage), terminal=terminal, **situation)
+
+
+def _situation(worlds: Worlds, ids: Tensor) -> tuple[Tensor, ...]:
+    """What `SITUATION` names, of worlds `ids`."""
+    sim = worlds.sim
+    return sim.x(ids), sim.u(ids), worlds.memory[ids], worlds.mode[ids], sim.save(ids)

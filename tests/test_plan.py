@@ -116,12 +116,12 @@ def test_a_draw_budget_is_kept(solver, draws):
 
 
 @pytest.mark.parametrize("solver", ["sample", "exhaustive"])
-@pytest.mark.parametrize("steps", [8, 9, 100, 333])
+@pytest.mark.parametrize("steps", [8, 9, 60, 120])
 def test_a_control_step_budget_is_never_exceeded(solver, steps):
     result = plan(toy_task(8), FAR, solver=solver, budget=Budget(control_steps=steps))
     assert 8 <= result.control_steps <= steps
     assert result.stopped_by == "control_steps"
-    if steps >= 100:
+    if steps >= 60:
         assert result.control_steps > steps - 16, "what fits is used"
         assert result.cost < result.incumbent_cost
 
@@ -134,10 +134,10 @@ def test_control_steps_inside_modes_count():
 
     result = plan(toy_task(6, [Push(1.0), Nested()]), FAR, schedule=[1] * 6, iterations=0)
     assert result.control_steps == 6 + 60
-    budget = Budget(control_steps=400)
+    budget = Budget(control_steps=200)
     limited = plan(toy_task(6, [Push(1.0), Nested()]), FAR, schedule=[0] * 6, samples=2, budget=budget)
     assert limited.stopped_by == "control_steps"
-    assert limited.control_steps <= 400 + 2 * 66, "at most one batch too many"
+    assert limited.control_steps <= 200 + 2 * 66, "at most one batch too many"
     assert 6 * limited.rollouts < limited.control_steps
 
 

@@ -55,6 +55,31 @@ def test_a_shifted_plan_predicts_the_tail_of_the_last_one(exact):
         predicted = evaluator.trace(tick.plan.schedule)
 
 
+def test_what_came_true_is_not_rolled_out_again():
+    """From the engine's own snapshot a tick rolls out one step of its incumbent, and plans the same."""
+    task = toy_task(8, hidden=0.4)
+
+    def run(forgetful):
+        loop, sim = (
+            Receding(task, schedule=LONG, samples=6, budget=Budget(draws=12), seed=3),
+            task.make_sim(1),
+        )
+        plans = []
+        for tick, _, _ in follow(loop, sim, 12):
+            plans.append(tick.plan)
+            if forgetful:
+                loop._known = None
+        return plans
+
+    told, fresh = run(False), run(True)
+    assert told == fresh
+    assert sum(p.control_steps for p in told) < sum(p.control_steps for p in fresh)
+    loop, sim = Receding(task, schedule=LONG, iterations=0), task.make_sim(1)
+    assert [tick.plan.control_steps for tick, _, _ in follow(loop, sim, 6)] == [8, 1, 1, 1, 1, 1]
+    loop = Receding(task, schedule=LONG, iterations=0)
+    assert [tick.plan.control_steps for tick, _, _ in follow(loop, sim, 3, exact=False)] == [8, 8, 8]
+
+
 def test_memory_is_kept_while_the_mode_runs_and_made_anew_on_return():
     ramp = Ramp()
     task = toy_task(8, [Push(1.0), Damp(), ramp])

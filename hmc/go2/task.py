@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from hmc.cost import Cost, StageFn
 from hmc.go2 import model as go2
 from hmc.go2.policy import Policy
-from hmc.go2.stances import FOOTSTAND, HANDSTAND, Stance
+from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.modes import ModeSet
 from hmc.mppi import Mppi, MppiCfg
 from hmc.sim.base import Sim
@@ -99,19 +99,16 @@ def timeline(command: int) -> Callable[[Tensor], Tensor]:
 def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
     """Table I with a target stance that depends on the control step: `hand(k)` (n,) bool."""
 
-    def select(k: Tensor, foot: Tensor, handstand: Tensor) -> Tensor:
-        return torch.where(hand(k)[:, None], handstand, foot)
-
     def height(x: Tensor, *_: Tensor) -> Tensor:
         return cfg.height * (go2.STANCE_HEIGHT - x[:, 2]).square()
 
     def orientation(x: Tensor, k: Tensor) -> Tensor:
-        gravity = -go2.vertical(x[:, 3:7])[:, :2]
-        target = select(k, _gravity_xy(FOOTSTAND, x), _gravity_xy(HANDSTAND, x))
-        return cfg.orientation * (gravity - target).square().sum(1)
+        up = go2.vertical(x[:, 3:7])
+        target = _targets(x.dtype, x.device)[0][hand(k).long()]
+        return cfg.orientation * ((up[:, 0] + target).square() + up[:, 1].square())
 
     def joints(x: Tensor, k: Tensor) -> Tensor:
-        target = select(k, FOOTSTAND.pose.to(x), HANDSTAND.pose.to(x))
+        target = _targets(x.dtype, x.device)[1][hand(k).long()]
         return cfg.joints * (x[:, 7:19] - target).square().sum(1)
 
     def rate(x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
@@ -122,7 +119,8 @@ def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
         return cfg.energy * power.norm(dim=1)
 
     def pose(x: Tensor, *_: Tensor) -> Tensor:
-        return cfg.pose * torch.exp(-(x[:, 7:19] - go2.HOME.to(x)).square().sum(1))
+        home = _targets(x.dtype, x.device)[2]
+        return cfg.pose * torch.exp(-(x[:, 7:19] - home).square().sum(1))
 
     def tail(x: Tensor, k: Tensor) -> Tensor:
         return cfg.tail * (height(x) + orientation(x, k) + joints(x, k))
@@ -138,8 +136,14 @@ def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
     return Cost(stage, {"tail": tail}, nonnegative=True)
 
 
-def _gravity_xy(stance: Stance, x: Tensor) -> Tensor:
-    return x.new_tensor([float(stance.sign), 0.0])
+@cache
+def _targets(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Of foot stand and handstand: gravity along the body's x axis (2,), pose (2, 12); home pose (12,)."""
+    stances = (FOOTSTAND, HANDSTAND)
+    with torch.inference_mode(False):
+        gravity = torch.tensor([float(stance.sign) for stance in stances], dtype=dtype, device=device)
+        pose = torch.stack([stance.pose for stance in stances]).to(device, dtype)
+        return gravity, pose, go2.HOME.to(device, dtype, copy=True)
 
 
 def policy_path(name: str, given: str = "") -> Path:

@@ -22,10 +22,13 @@ from hmc.go2.policy import Policy
 from hmc.go2.stances import HANDSTAND
 from hmc.go2.task import CostCfg, policy_path, stance_cost
 from hmc.modes import ModeSet
-from hmc.rollout import Worlds, roll
+from hmc.rollout import roll
+from hmc.schedule import Schedule, SwitchSpace
 from hmc.sim.mujoco import MujocoSim
 from hmc.start import make_start
 from hmc.task import Task
+from hmc.trace import root
+from hmc.worlds import Worlds
 from tools.benchmarks.figures import Common, Figures
 from tools.random_policy import write_random_policy
 
@@ -176,34 +179,39 @@ def _policy_mode(
 def _evaluator(
     figures: Figures, args: Engine, sim: MujocoSim, bare: Bare, policy: Policy, words: str
 ) -> None:
-    """The planner's rollouts under the same policy, costs included."""
+    """The planner's rollouts of single switches, costs included, against the steps that they come to."""
     cost = stance_cost(CostCfg(), lambda k: k >= 0)
-    task = Task("hold", ModeSet([policy]), cost, args.steps, lambda n: sim)
+    other = Policy(policy.path, name="other", threads=args.threads)
+    task = Task("hold", ModeSet([policy, other]), cost, args.steps, lambda n: sim)
     start = make_start(task, sim, HANDSTAND.state(), HANDSTAND.pose.double(), None, None, 0, None)
-    worlds, schedules = Worlds(task, sim), torch.zeros(args.worlds, args.steps, dtype=torch.long)
-    worlds.reset(start, torch.arange(args.worlds))
-    rows, targets, step = sim.save().numpy(), np.zeros((args.steps, args.worlds, 12)), sim.step
+    space, worlds = SwitchSpace(2, args.steps), Worlds(task, sim)
+    into_other = torch.arange(len(space) // 2, len(space))[: args.worlds]
+    schedules = space.stitch(Schedule.constant(0, args.steps), into_other)
+    trunk, step = root(worlds, start), sim.step
+    steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def keep(u: Tensor, ids: Tensor | None = None) -> None:
-        targets[keep.count] = u.numpy()  # type: ignore[attr-defined]
-        keep.count += 1  # type: ignore[attr-defined]
+        ids = torch.arange(args.worlds) if ids is None else ids
+        steps.append((ids.numpy(), sim.save(ids).numpy(), u.numpy()))
         step(u, ids)
 
-    keep.count = 0  # type: ignore[attr-defined]
     sim.step = keep  # type: ignore[method-assign]
-    roll(worlds, start, schedules)
+    roll(worlds, trunk, schedules)
     del sim.step
 
     def rollouts() -> Iterator[None]:
-        roll(worlds, start, schedules)
+        roll(worlds, trunk, schedules)
         yield
 
     def whole() -> Iterator[None]:
-        deque(bare.replay(rows, targets), maxlen=0)
+        for ids, rows, target in steps:
+            bare.batch.state[ids] = rows
+            bare.ctrl[ids] = target
+            bare.batch.step(ids, nstep=SUBSTEPS)
         yield
 
     times = take_turns(rollouts, whole, args)
-    same(sim.save().numpy(), bare.batch.state, "evaluator")
-    add_ratio(
-        figures, "evaluator", times, args.worlds * args.steps * SUBSTEPS, f"rollouts with costs, {words}"
-    )
+    last = steps[-1][0]
+    same(sim.save().numpy()[last], bare.batch.state[last], "evaluator")
+    made = sum(len(ids) for ids, _, _ in steps) * SUBSTEPS
+    add_ratio(figures, "evaluator", times, made, f"{len(schedules)} schedules with costs, {words}")
