@@ -49,7 +49,7 @@ class Mode(ABC):
         """
 
 
-class ModeSet(Sequence[Mode]):
+class ModeSet:
     """An ordered set of modes; a schedule refers to them by index."""
 
     def __init__(self, modes: Sequence[Mode]):
@@ -69,10 +69,10 @@ class ModeSet(Sequence[Mode]):
     def __iter__(self) -> Iterator[Mode]:
         return iter(self._modes)
 
-    def __getitem__(self, key):  # type: ignore[no-untyped-def]
-        return self._modes[self.index(key)] if isinstance(key, str) else self._modes[key]
+    def __getitem__(self, name: str | int) -> Mode:
+        return self._modes[self.index(name)]
 
-    def index(self, name: str | int) -> int:  # type: ignore[override]
+    def index(self, name: str | int) -> int:
         """Index of the mode called `name`; an index is checked and comes back as it is."""
         if isinstance(name, str) and name in self.names:
             return self.names.index(name)

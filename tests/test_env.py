@@ -243,9 +243,23 @@ def test_four_legs_wait_until_the_stance_is_held():
     assert 60 < (starts.sample(200).kind == HOME).sum() < 140
 
 
+def test_four_legs_wait_until_the_way_is_open_to_nearly_horizontal():
+    starts = Starts(FOOTSTAND, StartsCfg(stance=0.4, way=0.3, home=0.3), CPU)
+    starts.rates[STANCE] = 0.9
+    starts.success[6] = 0.9
+    assert not (starts.sample(200).kind == HOME).any()
+    starts.success[7, 2] = 0.9
+    assert 20 < (starts.sample(200).kind == HOME).sum() < 100
+
+
+def test_a_place_that_is_not_on_the_grid_is_named():
+    with pytest.raises(ValueError, match=r"starts\.furthest must be .*got 0\.55"):
+        Starts(HANDSTAND, StartsCfg(furthest=0.55), CPU)
+
+
 def test_cells_open_next_to_mastered_ones():
     starts = Starts(HANDSTAND, StartsCfg(way=1.0), CPU)
-    places, energies = starts.PLACES, starts.ENERGIES
+    places, energies = starts.places, starts.ENERGIES
     first = torch.zeros(places, energies, dtype=torch.bool)
     first[:2] = True
     assert torch.equal(starts.weights() > 0, first), "in the beginning, those next to the stance"
@@ -266,7 +280,7 @@ def test_reports_move_the_right_entries():
     cell = torch.tensor([5, 5, 12, 5, 3])
     kind = torch.tensor([WAY, WAY, WAY, STANCE, STANCE])
     starts.report(kind, cell, torch.tensor([True, False, True, True, True]))
-    expected = torch.zeros(starts.PLACES * starts.ENERGIES)
+    expected = torch.zeros(starts.places * starts.ENERGIES)
     expected[5] = (1 - 0.95**2) * 0.5
     expected[12] = 1 - 0.95
     torch.testing.assert_close(starts.success.flatten(), expected)
@@ -278,6 +292,6 @@ def test_frontier():
     starts = Starts(HANDSTAND, StartsCfg(way=1.0, furthest=-1.0), CPU)
     assert starts.frontier() == 1.0
     starts.success[4, 2] = 0.9
-    assert starts.frontier() == pytest.approx(1.0 - 5 * 2.0 / starts.PLACES)
+    assert starts.frontier() == pytest.approx(1.0 - 5 * starts.WIDTH)
     starts.success[-1, 0] = 0.9
     assert starts.frontier() == pytest.approx(-1.0)

@@ -52,7 +52,7 @@ def timeline(
     axes[1].set_xlabel("time [s]; dotted: the command")
     handles = [Rectangle((0, 0), 1, 1, color=COLORS[name], alpha=0.35) for name in COLORS]
     axes[0].legend(handles, COLORS, loc="lower right", ncols=3, fontsize=8)
-    _save(figure, path)
+    save(figure, path)
 
 
 def cost_terms(path: Path, names: Sequence[str], terms: np.ndarray, modes: Sequence[str], dt: float) -> None:
@@ -71,7 +71,7 @@ def cost_terms(path: Path, names: Sequence[str], terms: np.ndarray, modes: Seque
     axis.set_ylabel("stage cost")
     axis.set_xlabel("time [s]")
     axis.legend(fontsize=8, ncols=3)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _bands(axis: Axes, modes: Sequence[str], dt: float) -> None:
@@ -85,7 +85,7 @@ def _bands(axis: Axes, modes: Sequence[str], dt: float) -> None:
     axis.margins(x=0)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
     partial = path.with_suffix(".partial.png")
     figure.savefig(partial, dpi=130)
     plt.close(figure)

@@ -70,14 +70,20 @@ class Starts:
         unlocked: draw all kinds from the beginning, as to measure a policy.
     """
 
-    PLACES, ENERGIES = 20, 7
+    WIDTH, ENERGIES = 0.1, 7  # of a place; number of energies
     ENERGY_LOW, ENERGY_HIGH = 0.0, 1.4
+    HORIZONTAL = 0.2  # four-legged starts wait until the way is open up to here
 
     def __init__(self, stance: Stance, cfg: StartsCfg, device: torch.device, *, unlocked: bool = False):
         self.stance, self.cfg, self.device = stance, cfg, device
         self.unlocked = unlocked
         self.other = FOOTSTAND if stance is HANDSTAND else HANDSTAND
-        self.success = torch.zeros(self.PLACES, self.ENERGIES, device=device)
+        self.places = round((1.0 - cfg.furthest) / self.WIDTH)
+        if not math.isclose(self.places * self.WIDTH, 1.0 - cfg.furthest) or not 0 < self.places <= 20:
+            raise ValueError(
+                f"starts.furthest must be -1, -0.9 ... 0.9, in steps of {self.WIDTH}; got {cfg.furthest}"
+            )
+        self.success = torch.zeros(self.places, self.ENERGIES, device=device)
         self.rates = torch.zeros(len(KINDS), device=device)
         self.shares = torch.tensor([cfg.stance, cfg.way, cfg.home, cfg.recorded], device=device)
         self.records: dict[str, Tensor] | None = None
@@ -94,8 +100,7 @@ class Starts:
         cell = torch.multinomial(self.weights().flatten(), n, replacement=True)
         column = torch.div(cell, self.ENERGIES, rounding_mode="floor")
         on_way = kind == WAY
-        span = (1.0 - self.cfg.furthest) / self.PLACES
-        place[on_way] = (1.0 - (column + self._uniform(n, 0, 1)) * span)[on_way]
+        place[on_way] = (1.0 - (column + self._uniform(n, 0, 1)) * self.WIDTH)[on_way]
         width = (self.ENERGY_HIGH - self.ENERGY_LOW) / self.ENERGIES
         energy[on_way] = (self.ENERGY_LOW + (cell % self.ENERGIES + self._uniform(n, 0, 1)) * width)[on_way]
         place[kind == HOME] = 0.0
@@ -119,13 +124,15 @@ class Starts:
         return (p * (1 - p) + 0.04) * opened
 
     def _shares(self) -> Tensor:
-        """Shares of the kinds: four-legged and recorded starts wait until the stance itself is held.
+        """Shares of the kinds: recorded starts wait until the stance is held, four-legged ones until it is
+        reached from nearly horizontal.
 
         Their early episodes are long and teach nothing; they would be most of a batch.
         """
-        if self.unlocked or self.rates[STANCE] > 0.5:
-            return self.shares
-        return self.shares * self.shares.new_tensor([1.0, 1.0, 0.0, 0.0])
+        held = bool(self.rates[STANCE] > 0.5)
+        near = self.cfg.way == 0 or self.frontier() <= self.HORIZONTAL
+        ready = self.shares.new_tensor([True, True, held and near, held])
+        return self.shares if self.unlocked else self.shares * ready
 
     def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
         """Learn from ended episodes: their kind, cell and whether they ended standing, all (n,)."""
@@ -138,7 +145,7 @@ class Starts:
         """Furthest place from which some energy succeeds in more than a third of the episodes."""
         good = (self.success > 0.35).any(1).nonzero()
         rows = int(good.max()) + 1 if len(good) else 0
-        return 1.0 - rows * (1.0 - self.cfg.furthest) / self.PLACES
+        return 1.0 - rows * self.WIDTH
 
     def state_dict(self) -> dict[str, Tensor]:
         """What a checkpoint must keep."""

@@ -1,0 +1,97 @@
+"""Learning curves of training runs: `python tools/curves.py out/train/handstand out/train/footstand`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # noqa: E402
+
+from hmc.cli import one_line_errors  # noqa: E402
+from tools.figures import save  # noqa: E402
+from train.runner import read_checkpoint  # noqa: E402
+
+CURVES = {
+    "/success/stance": "held from the stance",
+    "/success/way": "reached from the open grid",
+    "/success/home": "reached from four legs",
+    "/success/recorded": "caught in flips",
+}
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line.
+
+    Attributes:
+        runs: folders of train/ppo.py.
+        out: picture to write.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    out: Path = ROOT / "out" / "train" / "learning.png"
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """One training run.
+
+    Attributes:
+        mode: what was trained.
+        batch: environment steps an iteration.
+        lines: tensorboard tag -> (iterations, values), (n,) each.
+    """
+
+    mode: str
+    batch: int
+    lines: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def read(folder: Path) -> Curves:
+    """What a training run has logged; a resumed run counts from its last start at each iteration."""
+    config = json.loads(read_checkpoint(folder / "latest.pt")["infos"]["meta"]["config"])
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    lines = {}
+    for tag in (*CURVES, "/success/frontier"):
+        if tag in events.Tags()["scalars"]:
+            last = {event.step: event.value for event in events.Scalars(tag)}
+            lines[tag] = np.array(sorted(last)), np.array([last[step] for step in sorted(last)])
+    return Curves(config["env"]["mode"], config["env"]["worlds"] * config["ppo"]["steps"], lines)
+
+
+def main(args: Args) -> None:
+    """Draw all runs side by side."""
+    with one_line_errors():
+        runs = [read(folder) for folder in args.runs]
+    figure, axes = plt.subplots(
+        1, len(runs), figsize=(5 * len(runs), 3.4), sharey=True, squeeze=False, constrained_layout=True
+    )
+    for axis, run in zip(axes[0], runs, strict=True):
+        for tag, words in CURVES.items():
+            if tag in run.lines:
+                steps, values = run.lines[tag]
+                axis.plot(steps * run.batch / 1e6, values, label=words)
+        steps, values = run.lines["/success/frontier"]
+        axis.plot(steps * run.batch / 1e6, values, color="grey", linestyle=":", label="furthest open place")
+        axis.set_title(run.mode)
+        axis.set_xlabel("environment steps [million]")
+        axis.set_ylim(-1.05, 1.05)
+        axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("share of episodes; place")
+    axes[0, -1].legend(fontsize=8, loc="lower right")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    save(figure, args.out)
+    print(args.out)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
