@@ -23,9 +23,9 @@ def terms(stance: Stance = HANDSTAND, x=None, before=None, u=None, u_prev=None, 
     before = x if before is None else before
     u = x[7:19] if u is None else u
     u_prev = u if u_prev is None else u_prev
-    rows = [row[None].double() for row in (x, before, u, u_prev)]
+    x, before, u, u_prev = (row[None].double() for row in (x, before, u, u_prev))
     anchor = torch.zeros(1, 4, dtype=torch.float64)
-    found = stage_rewards(cfg, stance, *rows, anchor, DT, go2.clearances(rows[0]))
+    found = stage_rewards(cfg, stance, x, before, u, u_prev, anchor, DT, go2.clearances(x))
     return {name: float(value[0]) for name, value in found.items()}
 
 
