@@ -1,4 +1,4 @@
-"""Draw how the planner gets to a schedule, on the example of docs/planner.md: `python tools/search_figure.py`."""
+"""Draw the search of the example in docs/planner.md: `python tools/search_figure.py`."""
 
 from __future__ import annotations
 
