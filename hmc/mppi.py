@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hmc.cost import Cost
 from hmc.modes import Mode
-from hmc.sim.base import Sim
+from hmc.sim.base import Sim, rollout
 
 
 @dataclass(frozen=True)
@@ -211,17 +211,20 @@ class Mppi(Mode):
         return torch.cat(parts).reshape(n, s)
 
     def _rollout_part(self, sim: Sim, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
-        ids = torch.arange(len(x), device=sim.device)
+        n, horizon = len(x), self.cfg.horizon
+        ids = torch.arange(n, device=sim.device)
         sim.reset(x, u, ids)
         controls = (self.spline.to(theta) @ theta).clamp(self.lower.to(x), self.upper.to(x))
-        total = x.new_zeros(len(x))
-        for i in range(self.cfg.horizon):
-            u_next = controls[:, i]
-            total += self.cost.stage_terms(x, u_next, u, k + i).sum(1) * sim.dt
-            sim.step(u_next, ids)
-            x, u = sim.x(ids), u_next
-        self.control_steps += len(x) * self.cfg.horizon
-        return total + self.cost.terminal_terms(x, k + self.cfg.horizon).sum(1)
+        states = torch.cat([x[:, None], rollout(sim, controls, ids)], 1)
+        before = torch.cat([u[:, None], controls[:, :-1]], 1)
+        steps = k[:, None] + torch.arange(horizon, device=k.device)
+        rows = states[:, :-1].reshape(n * horizon, -1), controls.reshape(n * horizon, -1)
+        terms = self.cost.stage_terms(*rows, before.reshape(n * horizon, -1), steps.reshape(-1))
+        total = x.new_zeros(n)
+        for stage in (terms.sum(1) * sim.dt).reshape(n, horizon).unbind(1):  # in this order at any n
+            total = total + stage
+        self.control_steps += n * horizon
+        return total + self.cost.terminal_terms(states[:, -1], k + horizon).sum(1)
 
 
 def _interpolate(at: Tensor, knots: int) -> Tensor:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from hmc.go2.model import clearances, load_model
-from hmc.sim.base import Sim
+from hmc.sim.base import Sim, rollout
 from hmc.sim.cartpole import CartpoleSim
 from hmc.sim.make import make_sim
 from hmc.sim.mujoco import MujocoSim
@@ -192,6 +192,16 @@ def test_a_step_of_some_leaves_the_others(sim):
     assert torch.equal(run(sim, u[:, ids], ids), whole[:, ids])
     assert torch.equal(sim.save(others), before[others])
     assert torch.equal(run(sim, u[:, others], others), whole[:, others])
+
+
+def test_a_rollout_is_its_steps(sim):
+    """In one call or step by step: the same states, inputs and snapshots, in the order of the ids."""
+    u, ids = inputs(sim, 6), index(sim, 3, 0, 4)
+    states = rollout(sim, u[:, ids].transpose(0, 1), ids)
+    reached = sim.save()
+    restart(sim)
+    assert torch.equal(states.transpose(0, 1), run(sim, u[:, ids], ids))
+    assert torch.equal(sim.save(), reached)
 
 
 def test_a_step_of_none_does_nothing(sim):

@@ -79,3 +79,27 @@ class Sim(Protocol):
     def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
         """Continue from snapshot rows (n, ns)."""
         ...
+
+
+def rollout(sim: Sim, controls: Tensor, ids: Tensor) -> Tensor:
+    """States after each control step under given inputs (n, H, nu) in worlds `ids` (n,), (n, H, nx).
+
+    Engines that can do it in one call have a method of this name; a world that diverges may there repeat
+    its last state.
+    """
+    if isinstance(sim, CanRollOut):
+        return sim.rollout(controls, ids)
+    states = []
+    for u in controls.unbind(1):
+        sim.step(u, ids)
+        states.append(sim.x(ids))
+    return torch.stack(states, 1)
+
+
+@runtime_checkable
+class CanRollOut(Protocol):
+    """An engine that makes many control steps in one call."""
+
+    def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
+        """See the function of this name."""
+        ...

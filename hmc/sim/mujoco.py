@@ -92,6 +92,17 @@ class MujocoSim:
         # the engine takes indices in ascending order only
         self.batch.step(None if ids is None else ids.sort().values.numpy(), nstep=self._substeps)
 
+    def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
+        """States after each control step under given inputs, as `hmc.sim.base.rollout`, in one call."""
+        check(self.num_worlds, ids, controls=(controls[:, 0], self.nu))
+        order = ids.argsort()  # the engine takes indices in ascending order only
+        held = controls[order].repeat_interleave(self._substeps, 1).to(torch.float64)
+        steps = held.shape[1]
+        found = self.batch.rollout(steps, held.numpy(), record=("qpos", "qvel"), ids=ids[order].numpy())
+        last = slice(self._substeps - 1, None, self._substeps)
+        x = torch.cat([torch.from_numpy(found[part])[:, last] for part in ("qpos", "qvel")], 2)
+        return x[order.argsort()]
+
     def save(self, ids: Tensor | None = None) -> Tensor:
         return self._row.clone() if ids is None else self._row[ids]
 
