@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hmc.planner import plan as plan
     from hmc.receding import Receding as Receding
     from hmc.receding import Tick as Tick
+    from hmc.rules import Rules as Rules
     from hmc.schedule import Schedule as Schedule
     from hmc.schedule import Switch as Switch
     from hmc.schedule import SwitchSpace as SwitchSpace
@@ -37,6 +38,7 @@ _HOME = {
     "plan": "hmc.planner",
     "Receding": "hmc.receding",
     "Tick": "hmc.receding",
+    "Rules": "hmc.rules",
     "Schedule": "hmc.schedule",
     "Switch": "hmc.schedule",
     "SwitchSpace": "hmc.schedule",

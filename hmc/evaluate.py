@@ -51,11 +51,12 @@ class Evaluator:
         rollouts: schedules rolled out so far.
         diverged: schedules among them whose world stopped being finite.
         pruned: schedules among them given up because their partial cost exceeded the bound.
+        ruled_out: schedules that the task's rules do not allow; their cost is inf.
     """
 
     def __init__(self, task: Task, sim: Sim, start: Start, known: Trace | None = None):
         self.task, self.sim, self.start = task, sim, start
-        self.rollouts = self.diverged = self.pruned = 0
+        self.rollouts = self.diverged = self.pruned = self.ruled_out = 0
         self._worlds = Worlds(task, sim)
         self.trunk = root(self._worlds, start)
         if known is not None and known.meets(self.trunk):
@@ -92,6 +93,7 @@ class Evaluator:
             if known is None or not known.answers(bound):
                 todo.setdefault(key, row)
         fresh, rows = list(todo), torch.tensor(list(todo.values()), dtype=torch.long)
+        fresh, rows = self._allowed(fresh, rows, schedules)
         if len(fresh) > self.sim.num_worlds:  # neighbours share most: let them be in one chunk
             order = in_order(schedules[rows].cpu().numpy(), self.trunk.modes[: len(self.trunk)])
             fresh, rows = [fresh[i] for i in order], rows[order]
@@ -106,12 +108,18 @@ class Evaluator:
     @torch.no_grad()
     def follow(self, schedule: Schedule) -> float:
         """Cost of a schedule that is recorded, so that others are rolled out from where they part from it."""
-        self.trunk = record(self._worlds, self.trunk, schedule)
-        key = self._keys(schedule.tensor()[None])[0]
+        rows = schedule.tensor()[None]
+        key = self._keys(rows)[0]
         known = self._known.get(key)
+        if known is None and not self._allowed([key], torch.tensor([0]), rows)[0]:
+            return math.inf
+        if known is not None and known.terms is not None and not math.isfinite(known.cost):
+            return math.inf
+        self.trunk = record(self._worlds, self.trunk, schedule)
         if known is None or known.terms is None:
             self.rollouts += 1
-            self.diverged += not math.isfinite(self.trunk.cost)
+            self.ruled_out += self.trunk.barred
+            self.diverged += not (math.isfinite(self.trunk.cost) or self.trunk.barred)
             self._known[key] = _Known(self.trunk.cost, self.trunk.terms.tolist())
         return self.trunk.cost
 
@@ -129,10 +137,22 @@ class Evaluator:
         """The trajectory of one schedule; its control steps are not counted."""
         return record(Worlds(self.task, self.sim), self.trunk, schedule)
 
+    def _allowed(self, keys: list[bytes], rows: Tensor, schedules: Tensor) -> tuple[list[bytes], Tensor]:
+        """The keys and rows of schedules that break no rule; what breaks one is known to cost inf."""
+        rules = self.task.rules
+        if rules is None or not keys:
+            return keys, rows
+        broken = rules.broken(self.task.modes, schedules[rows], self.start.mode, self.start.ran)
+        for i in broken.nonzero().squeeze(1).tolist():
+            self._known[keys[i]] = _Known(math.inf, [math.nan] * len(self.task.cost.names))
+        self.ruled_out += int(broken.sum())
+        return [key for key, bad in zip(keys, broken.tolist(), strict=True) if not bad], rows[~broken]
+
     def _learn(self, keys: list[bytes], rolled: Rolled) -> None:
         self.rollouts += len(keys)
         self.diverged += int(rolled.diverged.sum())
         self.pruned += int(rolled.pruned.sum())
+        self.ruled_out += int(rolled.barred.sum())
         rows = zip(rolled.cost.tolist(), rolled.terms.tolist(), rolled.pruned.tolist(), strict=True)
         for key, (cost, terms, pruned) in zip(keys, rows, strict=True):
             self._known[key] = _Known(cost, None if pruned else terms)

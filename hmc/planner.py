@@ -39,6 +39,8 @@ class Plan:
         control_steps: control steps rolled out, over all worlds and inside the modes; not compared, as
             schedules share their beginnings only where a batch fits into the simulator.
         diverged: rollouts whose world stopped being finite; their cost is inf.
+        ruled_out: schedules that the task's rules do not allow; their cost is inf.
+        fell_back: whether no schedule with a finite cost was found and `schedule` is the rules' fallback.
         stopped_by: "converged", "iterations", "draws", "control_steps", "seconds", "progress" or
             "interrupt"; "" while the search goes on.
         elapsed: wall-clock time [s]; not compared.
@@ -57,6 +59,8 @@ class Plan:
     rollouts: int
     control_steps: int = field(compare=False)
     diverged: int
+    ruled_out: int
+    fell_back: bool
     stopped_by: str
     elapsed: float = field(compare=False)
     known: Trace = field(compare=False, repr=False)
@@ -91,12 +95,14 @@ class Plan:
 
     def __str__(self) -> str:
         lines = [
-            str(self.schedule),
+            str(self.schedule)
+            + ("  (the fallback: no schedule has a finite cost)" if self.fell_back else ""),
             f"cost {self.cost:.6g} (incumbent {self.incumbent_cost:.6g}), {len(self.switches)} switches; "
             + ("locally optimal" if self.locally_optimal else f"coverage {self.coverage:.1%}")
             + f" of {self.space_size:,} switches",
             f"{self.draws:,} draws, {self.control_steps:,} control steps in {self.elapsed:.3g} s"
             + (f", {self.diverged} rollouts diverged" if self.diverged else "")
+            + (f", {self.ruled_out} schedules against the rules" if self.ruled_out else "")
             + (f"; stopped by {self.stopped_by}" if self.stopped_by else ""),
         ]
         if self.machine_dependent:
@@ -121,6 +127,7 @@ def plan(
     memory: Vector | None = None,
     k: int = 0,
     snapshot: Tensor | None = None,
+    ran: int | None = None,
     schedule: Sequence[int | str] | None = None,
     solver: str = "sample",
     samples: int = 64,
@@ -141,13 +148,15 @@ def plan(
 
     Args:
         task: modes, cost, horizon T and simulator.
-        x: state to plan from, (nx,); or a `Start`, which has u, mode, memory, k and snapshot inside.
+        x: state to plan from, (nx,); or a `Start`, which has u, mode, memory, k, snapshot and ran
+            inside.
         u: input applied last, (nu,); zero if left out.
         mode: the mode now running, by index or name.
         memory: what that mode remembers, (its memory_size,): a schedule that begins with `mode` goes on
             with it. Left out, the mode is entered anew.
         k: control steps since the start of the task.
         snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
+        ran: control steps that the running mode has run, for rules on dwell times; None: long enough.
         schedule: the incumbent, T modes by index or name; by default `mode` (else mode 0) throughout.
         solver: "sample" (Algorithms 1 and 2) takes the best of the first batch that improves; "exhaustive"
             (Algorithm 1) evaluates all of Omega and takes the best.
@@ -177,13 +186,18 @@ def plan(
         for each in task.modes:
             each.forget()
     if isinstance(x, Start):
-        if any(value is not None for value in (u, mode, memory, snapshot)) or k != 0:
-            raise ValueError("a Start has u, mode, memory, k and snapshot inside: do not pass them as well")
+        if any(value is not None for value in (u, mode, memory, snapshot, ran)) or k != 0:
+            raise ValueError(
+                "a Start has u, mode, memory, k, snapshot and ran inside: do not pass them as well"
+            )
         u, mode, memory, k, snapshot = x.u, x.mode, x.memory if x.mode is not None else None, x.k, x.snapshot
-        x = x.x
-    start = make_start(task, sim, x, u, mode, memory, k, snapshot)
+        ran, x = x.ran, x.x
+    start = make_start(task, sim, x, u, mode, memory, k, snapshot, ran)
     meter = Meter(budget or Budget(), Evaluator(task, sim, start, known))
     incumbent = _incumbent(task, start, mode, schedule)
+    if start.mode is not None and not math.isfinite(meter.evaluator.follow(incumbent)):
+        stay = Schedule.constant(start.mode, task.horizon, task.modes.names)
+        incumbent = stay if math.isfinite(meter.evaluator.follow(stay)) else incumbent
     search = Search(meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed), order)
     if progress is not None:
         search.report = lambda search: progress(_plan(search, incumbent))
@@ -213,8 +227,12 @@ def _incumbent(
 
 def _plan(search: Search, incumbent: Schedule) -> Plan:
     evaluator = search.evaluator
+    schedule, modes, rules = search.schedule, evaluator.task.modes, evaluator.task.rules
+    fallback = None if rules is None or math.isfinite(search.costs[-1]) else rules.fallback
+    if fallback is not None:
+        schedule = Schedule.constant(modes.index(fallback), len(schedule), modes.names)
     return Plan(
-        schedule=search.schedule,
+        schedule=schedule,
         terms=evaluator.terms(search.schedule),
         incumbent=incumbent,
         switches=tuple(search.switches),
@@ -225,6 +243,8 @@ def _plan(search: Search, incumbent: Schedule) -> Plan:
         rollouts=evaluator.rollouts,
         control_steps=evaluator.control_steps,
         diverged=evaluator.diverged,
+        ruled_out=evaluator.ruled_out,
+        fell_back=fallback is not None,
         stopped_by=search.stopped_by or "",
         elapsed=search.meter.elapsed,
         known=evaluator.trunk,

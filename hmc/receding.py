@@ -43,6 +43,7 @@ class Receding:
         k: control steps since the start of the task.
         schedule: incumbent of the next tick; None before the first one: `plan`'s default.
         mode: the mode now running; None before the first tick.
+        ran: control steps that it has been running.
         memory: what it remembers, (its memory_size,).
         u: input applied last, (nu,).
 
@@ -74,6 +75,7 @@ class Receding:
         self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
         self.sim = sim if sim is not None else task.make_sim(samples)
         self.mode: int | None = None
+        self.ran: int | None = None
         self.memory: Tensor | None = None
         self.u: Tensor | None = None
         self._known: Trace | None = None
@@ -100,7 +102,7 @@ class Receding:
             snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
         """
         last = self.u if u is None else u
-        start = make_start(self.task, self.sim, x, last, self.mode, self.memory, self.k, snapshot)
+        start = make_start(self.task, self.sim, x, last, self.mode, self.memory, self.k, snapshot, self.ran)
         known = None if self._known is None else self._known.since(1)
         result = self._plan(
             start, schedule=self.schedule, seed=(self.seed, self.k), forget=known is None, known=known
@@ -115,6 +117,7 @@ class Receding:
         running = self.task.modes[mode]
         k = torch.tensor([self.k], device=x.device)
         memory = None if self.memory is None or mode != self.mode else self.memory[None]
+        self.ran = (self.ran or 0) + 1 if mode == self.mode else 1
         if memory is None:
             memory = running.reset(x[None], u[None], k)
         action, memory = running.act(x[None], u[None], memory, k)

@@ -24,12 +24,14 @@ class Rolled:
         terms: each term's share, (n, number of terms) float64; NaN where diverged or pruned.
         diverged: worlds whose state, input or cost stopped being finite, (n,) bool.
         pruned: worlds given up because their partial cost exceeded the bound, (n,) bool.
+        barred: worlds that came to a mode whose guard barred it, (n,) bool; their cost is inf.
     """
 
     cost: Tensor
     terms: Tensor
     diverged: Tensor
     pruned: Tensor
+    barred: Tensor
 
 
 def roll(
@@ -57,11 +59,11 @@ def roll(
     tree = branches(schedules.cpu(), trunk.modes[: len(trunk)])
     modes, parents = tree.modes.to(sim.device), tree.parent.to(sim.device)
     limit = bound if cost.nonnegative else math.inf
-    stages = len(cost.stage)
+    stages, guarded = len(cost.stage), worlds.task.rules is not None and bool(worlds.task.rules.guards)
     result = torch.full((n,), math.inf, dtype=torch.float64, device=sim.device)
     terms = torch.zeros(n, len(cost.names), dtype=torch.float64, device=sim.device)
     pruned = torch.zeros(n, dtype=torch.bool, device=sim.device)
-    going = torch.zeros(n, dtype=torch.bool, device=sim.device)
+    barred, going = torch.zeros_like(pruned), torch.zeros_like(pruned)
     ids = going.nonzero().squeeze(1)  # branch j runs in world j: those that are going on
     for i in range(horizon + 1):
         if stop is not None and stop():
@@ -76,7 +78,7 @@ def roll(
                 terms[seeds, :stages], going[seeds] = trunk.sums[i], True
             if len(shoots) > 0:
                 worlds.branch(stems, shoots)
-                for each in (terms, result, pruned, going):  # a stem that has ended passes on its end
+                for each in (terms, result, pruned, barred, going):  # a stem that has ended passes on its end
                     each[shoots] = each[stems]
             ids = going[: born.stop].nonzero().squeeze(1)
         if len(ids) == 0:
@@ -93,6 +95,11 @@ def roll(
             terms[ids, stages:] = cost.terminal_terms(x, k).to(torch.float64)
             result[ids] = total(terms[ids])
             break
+        if guarded and bool((bad := worlds.barred(ids, modes[ids, i], x, k)).any()):
+            barred[ids[bad]], going[ids[bad]] = True, False
+            ids, x, k = ids[~bad], x[~bad], k[~bad]
+            if len(ids) == 0:
+                continue
         u_prev = sim.u(_indexed(sim, ids))
         u = worlds.act(ids, modes[ids, i], x, u_prev, k)
         terms[ids, :stages] += stage_terms(worlds.task, x, u, u_prev, k, sim.dt)
@@ -107,11 +114,11 @@ def roll(
                 continue
         sim.step(u, _indexed(sim, ids))
         worlds.control_steps += len(ids)
-    diverged = ~result.isfinite() & ~pruned
-    result[diverged] = math.inf
-    terms[diverged | pruned] = math.nan
+    result[result.isnan()] = math.inf
+    diverged = ~result.isfinite() & ~pruned & ~barred
+    terms[~result.isfinite() | pruned] = math.nan
     back = tree.row.argsort().to(sim.device)
-    return Rolled(result[back], terms[back], diverged[back], pruned[back])
+    return Rolled(result[back], terms[back], diverged[back], pruned[back], barred[back])
 
 
 def _indexed(sim: Sim, ids: Tensor) -> Tensor | None:

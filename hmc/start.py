@@ -27,6 +27,7 @@ class Start:
         k: control steps since the start of the task.
         snapshot: engine snapshot row of this state, (ns,), where there is one: warm start and actuator
             states go on as well. x and u must be those of the snapshot.
+        ran: control steps that the mode has been running, for rules on dwell times; None: long enough.
     """
 
     x: Tensor
@@ -35,6 +36,7 @@ class Start:
     memory: Tensor
     k: int
     snapshot: Tensor | None = None
+    ran: int | None = None
 
 
 def make_start(
@@ -46,6 +48,7 @@ def make_start(
     memory: Vector | None = None,
     k: int = 0,
     snapshot: Tensor | None = None,
+    ran: int | None = None,
 ) -> Start:
     """A `Start` in the simulator's type and on its device, from values that are checked.
 
@@ -59,13 +62,15 @@ def make_start(
         if memory is not None:
             raise ValueError("memory was given without the mode it belongs to: pass mode= as well")
         return Start(x, u, None, x.new_zeros(0), k, snapshot)
+    if ran is not None and ran < 0:
+        raise ValueError(f"task {task.name!r}: the mode has been running for ran >= 0 steps, got {ran}")
     index = task.modes.index(mode)
     running = task.modes[index]
     if memory is None:
         known = None if running.memory_size else index
-        return Start(x, u, known, x.new_zeros(0), k, snapshot)
+        return Start(x, u, known, x.new_zeros(0), k, snapshot, ran)
     memory = _vector(f"memory of mode {running.name!r}", memory, running.memory_size, sim)
-    return Start(x, u, index, memory, k, snapshot)
+    return Start(x, u, index, memory, k, snapshot, ran)
 
 
 def _vector(what: str, values: Vector, size: int, sim: Sim) -> Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from hmc.cost import Cost
 from hmc.modes import ModeSet
+from hmc.rules import Rules
 from hmc.sim.base import Sim
 
 
@@ -20,6 +21,7 @@ class Task:
         cost: what to minimise.
         horizon: length T of a schedule in control steps.
         make_sim: number of worlds -> a simulator to plan in.
+        rules: what schedules have to respect; None for nothing.
     """
 
     name: str
@@ -27,9 +29,12 @@ class Task:
     cost: Cost
     horizon: int
     make_sim: Callable[[int], Sim]
+    rules: Rules | None = None
 
     def __post_init__(self) -> None:
         if self.horizon <= 0:
             raise ValueError(
                 f"task {self.name!r}: horizon must be at least 1 control step, got {self.horizon}"
             )
+        if self.rules is not None:
+            self.rules.check(self.modes)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -36,6 +36,8 @@ class Trace:
         snapshots: engine snapshot rows, (n + 1, ns).
         stage: stage terms of each step times dt, (n, number of stage terms).
         terminal: terminal terms, (number of terminal terms,); NaN where the world diverged.
+        ran: control steps that the mode of row 0 had been running; None: unknown.
+        barred: whether it ended because a guard barred the next step's mode.
     """
 
     task: Task
@@ -48,6 +50,8 @@ class Trace:
     snapshots: Tensor
     stage: Tensor
     terminal: Tensor
+    ran: int | None = None
+    barred: bool = False
 
     def __len__(self) -> int:
         """How many steps were recorded, n."""
@@ -90,12 +94,23 @@ class Trace:
             memory=self.memory[i, :size],
             k=self.k + i,
             snapshot=self.snapshots[i] if exact else None,
+            ran=self._ran(i),
         )
+
+    def _ran(self, i: int) -> int | None:
+        """How long the mode on arrival at step i has been running."""
+        since = next((j for j in range(i, 0, -1) if self.mode[j] != self.mode[j - 1]), 0)
+        if since > 0:
+            return i - since + 1
+        return None if self.ran is None else i + self.ran
 
     def since(self, i: int) -> Self:
         """The rest of this trace from its step i on, as the trace of the rest of its schedule."""
         rows = {name: getattr(self, name)[i:] for name in (*SITUATION, "stage")}
-        return type(self)(self.task, self.modes[i:], self.k + i, terminal=self.terminal, **rows)
+        ran = self._ran(i)
+        return type(self)(
+            self.task, self.modes[i:], self.k + i, terminal=self.terminal, ran=ran, barred=self.barred, **rows
+        )
 
     def meets(self, other: Trace) -> bool:
         """Whether both begin in the same situation, bit for bit."""
@@ -112,8 +127,16 @@ def root(worlds: Worlds, start: Start) -> Trace:
     worlds.reset(start, zero)
     stages, names = len(worlds.task.cost.stage), len(worlds.task.cost.names)
     none = torch.full((names,), math.nan, dtype=torch.float64, device=worlds.sim.device)
-    situation = dict(zip(SITUATION, _situation(worlds, zero), strict=True))
-    return Trace(worlds.task, (), start.k, stage=none[None, :stages][:0], terminal=none[stages:], **situation)
+    situation: dict[str, Any] = dict(zip(SITUATION, _situation(worlds, zero), strict=True))
+    return Trace(
+        worlds.task,
+        (),
+        start.k,
+        stage=none[None, :stages][:0],
+        terminal=none[stages:],
+        ran=start.ran,
+        **situation,
+    )
 
 
 @torch.no_grad()
@@ -132,7 +155,7 @@ def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
     worlds.reset(known.start(agree), zero)
     rows = [tuple(getattr(known, part)[: agree + 1] for part in SITUATION)]
     stage, sums = [known.stage[:agree]], known.sums[agree : agree + 1]
-    terminal = torch.full_like(known.terminal, math.nan)
+    terminal, barred = torch.full_like(known.terminal, math.nan), False
     for i in range(agree, len(modes) + 1):
         x, u_prev, k = rows[-1][0][-1:], rows[-1][1][-1:], torch.full_like(zero, known.k + i)
         if not finite(x).all():
@@ -140,7 +163,10 @@ def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
         if i == len(modes):
             terminal = task.cost.terminal_terms(x, k).to(torch.float64)[0]
             break
-        u = worlds.act(zero, torch.full_like(zero, modes[i]), x, u_prev, k)
+        chosen = torch.full_like(zero, modes[i])
+        if barred := bool(worlds.barred(zero, chosen, x, k).any()):
+            break
+        u = worlds.act(zero, chosen, x, u_prev, k)
         terms = stage_terms(task, x, u, u_prev, k, sim.dt)
         sums = sums + terms
         if not (finite(u) & finite(sums)).all():
@@ -152,7 +178,16 @@ def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
     situation = {
         part: torch.cat(column) for part, column in zip(SITUATION, zip(*rows, strict=True), strict=True)
     }
-    return Trace(task, modes, known.k, stage=torch.cat(stage), terminal=terminal, **situation)
+    return Trace(
+        task,
+        modes,
+        known.k,
+        stage=torch.cat(stage),
+        terminal=terminal,
+        ran=known.ran,
+        barred=barred,
+        **situation,
+    )
 
 
 def _situation(worlds: Worlds, ids: Tensor) -> tuple[Tensor, ...]:

@@ -43,6 +43,13 @@ class Worlds:
         self.mode[children] = self.mode[parents]
         self.memory[children] = self.memory[parents]
 
+    def barred(self, ids: Tensor, modes: Tensor, x: Tensor, k: Tensor) -> Tensor:
+        """Which of worlds `ids` would enter a mode whose guard bars it, (n,) bool; arguments as in `act`."""
+        rules = self.task.rules
+        if rules is None or not rules.guards:
+            return torch.zeros_like(ids, dtype=torch.bool)
+        return rules.barred(self.task.modes, modes != self.mode[ids], modes, x, k)
+
     def act(self, ids: Tensor, modes: Tensor, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
         """Let each world's mode choose its input; a mode that was not running before is entered first.
 

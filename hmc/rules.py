@@ -1,0 +1,96 @@
+"""Which schedules may run: dwell times, forbidden changes, a limit on changes, guards on the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from hmc.modes import ModeSet
+
+Guard = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a schedule has to respect, besides being cheap. Modes are given by name.
+
+    To stay in the running mode breaks no rule, so that there is always a schedule to go on with.
+
+    Attributes:
+        dwell: fewest control steps that a mode runs before another one takes over; the end of the horizon
+            may cut it short.
+        forbidden: changes (from, to) that must not be made.
+        max_changes: most changes of mode within a horizon; None for any number.
+        guards: f(x, k) -> (n,) bool, from states x (n, nx) at control steps k (n,): whether the mode may be
+            entered there.
+        fallback: the mode that runs if no schedule has a finite cost; None: the incumbent goes on.
+    """
+
+    dwell: Mapping[str, int] = field(default_factory=dict)
+    forbidden: Collection[tuple[str, str]] = ()
+    max_changes: int | None = None
+    guards: Mapping[str, Guard] = field(default_factory=dict)
+    fallback: str | None = None
+
+    def check(self, modes: ModeSet) -> None:
+        """Refuse names that `modes` does not have, and numbers that mean nothing."""
+        pairs = [name for pair in self.forbidden for name in pair]
+        for name in (*self.dwell, *pairs, *self.guards, *filter(None, [self.fallback])):
+            modes.index(name)
+        for name, steps in self.dwell.items():
+            if steps < 1:
+                raise ValueError(f"rules.dwell of mode {name!r} must be at least 1 control step, got {steps}")
+        for pair in self.forbidden:
+            if pair[0] == pair[1]:
+                raise ValueError(f"rules.forbidden has {pair!r}, which is no change: leave it out")
+        if self.max_changes is not None and self.max_changes < 0:
+            raise ValueError(f"rules.max_changes must be >= 0, got {self.max_changes}")
+
+    def broken(self, modes: ModeSet, schedules: Tensor, mode: int | None, ran: int | None) -> Tensor:
+        """Which of schedules (N, T) long break a rule, whatever the states will be, (N,) bool.
+
+        Args:
+            modes: what the indices mean.
+            schedules: mode indices.
+            mode: the mode now running; None if none is.
+            ran: control steps that it has been running; None for long enough.
+        """
+        n, horizon = schedules.shape
+        first = schedules[:, :1] if mode is None else torch.full_like(schedules[:, :1], mode)
+        before = torch.cat([first, schedules[:, :-1]], 1)
+        change = schedules != before
+        bad = torch.zeros(n, dtype=torch.bool, device=schedules.device)
+        if self.max_changes is not None:
+            bad |= change.sum(1) > self.max_changes
+        for one, other in self.forbidden:
+            bad |= ((before == modes.index(one)) & (schedules == modes.index(other))).any(1)
+        if self.dwell:
+            fewest = torch.ones(len(modes), dtype=torch.long, device=schedules.device)
+            for name, steps in self.dwell.items():
+                fewest[modes.index(name)] = steps
+            begun = 0 if mode is None else -(horizon + int(fewest.max()) if ran is None else ran)
+            step = torch.arange(horizon, device=schedules.device).expand(n, -1)
+            last = torch.where(change, step, begun).cummax(1).values
+            since = torch.cat([torch.full_like(last[:, :1], begun), last[:, :-1]], 1)
+            bad |= (change & (step - since < fewest[before])).any(1)
+        return bad
+
+    def barred(self, modes: ModeSet, entered: Tensor, chosen: Tensor, x: Tensor, k: Tensor) -> Tensor:
+        """Which worlds enter a mode whose guard says no, (n,) bool.
+
+        Args:
+            modes: what the indices mean.
+            entered: whether a world enters its mode at this step, (n,) bool.
+            chosen: its mode, (n,) long.
+            x: its state, (n, nx).
+            k: control step, (n,).
+        """
+        bad = torch.zeros_like(entered)
+        for name, guard in self.guards.items():
+            rows = (entered & (chosen == modes.index(name))).nonzero().squeeze(1)
+            if len(rows) > 0:
+                bad[rows] = ~guard(x[rows], k[rows])
+        return bad
