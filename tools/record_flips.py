@@ -7,6 +7,7 @@ a random number of steps. Policies are trained (train/starts.py) and measured (t
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,8 @@ class Args:
     """Command line.
 
     Attributes:
-        out: file to write: states "x" (n, 37), inputs "u" (n, 12), steps since the jump began "after" (n,).
+        out: file to write: states "x" (n, 37), inputs "u" (n, 12), steps since the jump began "after" (n,),
+            and the command that made it.
         states: number of jumps, one state of each.
         first: fewest steps of a jump before its state is kept.
         last: most.
@@ -70,7 +72,8 @@ def main(args: Args) -> None:
     finite = kept_x.isfinite().all(1)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     partial = args.out.with_suffix(".partial")
-    torch.save({"x": kept_x[finite], "u": kept_u[finite], "after": after[finite]}, partial)
+    kept = {"x": kept_x[finite].float(), "u": kept_u[finite].float(), "after": after[finite]}
+    torch.save({**kept, "command": shlex.join(["python", "tools/record_flips.py", *sys.argv[1:]])}, partial)
     os.replace(partial, args.out)
     print(f"{args.out}: {int(finite.sum())} states")
 

@@ -114,7 +114,7 @@ def set_up(args: Args) -> tuple[Policy, Starts]:
     """The policy and the states it begins from."""
     policy = Policy(args.policy)
     shares = {"stance": 0.0, "way": 0.0, "home": 0.0, "recorded": 0.0, args.starts: 1.0}
-    cfg = StartsCfg(**shares, records=str(args.records or ""))
+    cfg = StartsCfg(**shares, records=str(args.records.resolve()) if args.records else "")
     return policy, Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
 
 

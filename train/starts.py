@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from hmc.go2 import model as go2
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, Stance
 
+ROOT = Path(__file__).resolve().parents[1]
 GRAVITY = 9.81
 GYRATION2 = 0.033  # squared radius of gyration about the pitch axis [m^2]
 
@@ -37,7 +39,8 @@ class StartsCfg:
         tilt: disturbance of roll and pitch in the stance, uniform [rad].
         speed: disturbance of linear [m/s] and angular [rad/s] velocity, uniform.
         joints: disturbance of joint positions, uniform [rad].
-        records: .pt file with states "x" (n, 37) and inputs "u" (n, 12); empty for none.
+        records: .pt file of tools/record_flips.py, with states "x" (n, 37) and inputs "u" (n, 12); a path
+            that is not absolute begins at the repository; empty for none.
     """
 
     stance: float = 0.5
@@ -88,7 +91,7 @@ class Starts:
         self.shares = torch.tensor([cfg.stance, cfg.way, cfg.home, cfg.recorded], device=device)
         self.records: dict[str, Tensor] | None = None
         if cfg.records:
-            self.records = torch.load(cfg.records, map_location=device, weights_only=True)
+            self.records = _read(ROOT / cfg.records, device)
         elif cfg.recorded > 0:
             raise ValueError("starts.recorded > 0 needs starts.records, the file with the recorded states")
 
@@ -200,6 +203,18 @@ class Starts:
         x[:, 23] += omega
         x[:, 25:37] = self._uniform((n, 12), -1, 1) * cfg.speed
         return x
+
+
+def _read(path: Path, device: torch.device) -> dict[str, Tensor]:
+    """Recorded states and inputs."""
+    if not path.is_file():
+        raise ValueError(
+            f"starts.records: no such file {path}: make one with python tools/record_flips.py --out FILE"
+        )
+    found = torch.load(path, map_location=device, weights_only=True)
+    if not {"x", "u"} <= found.keys() or found["x"].shape[1:] != (37,) or found["u"].shape[1:] != (12,):
+        raise ValueError(f'starts.records: {path} lacks states "x" (n, 37) and inputs "u" (n, 12)')
+    return found
 
 
 def _average(values: Tensor, index: Tensor, samples: Tensor, keep: float) -> None:
