@@ -45,6 +45,16 @@ def test_two_iterations(trained):
     assert any(name.startswith("events.out.tfevents") for name in names), "tensorboard"
 
 
+def test_the_learning_rate_falls_at_the_end(tmp_path):
+    runner = make_runner(tmp_path)
+    runner.last_iteration, runner.anneal = 200, 0.25
+    full = runner.cfg["algorithm"]["learning_rate"]
+    for iteration, share in [(0, 1.0), (150, 1.0), (175, 0.5), (190, 0.2), (200, 0.01)]:
+        runner.set_learning_rate(iteration)
+        assert runner.alg.learning_rate == pytest.approx(share * full)
+        assert [g["lr"] for g in runner.alg.optimizer.param_groups] == [runner.alg.learning_rate]
+
+
 def test_a_checkpoint_says_how_it_was_made(trained):
     folder, *_ = trained
     infos = read_checkpoint(folder / "latest.pt")["infos"]

@@ -88,6 +88,8 @@ def set_up(args: Args) -> Runner:
     if checkpoint is not None:
         runner.resume(str(checkpoint))
     runner.last_iteration = args.iterations or cfg.ppo.iterations
+    runner.anneal = cfg.ppo.anneal
+    runner.set_learning_rate(runner.current_learning_iteration)
     return runner
 
 

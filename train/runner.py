@@ -46,6 +46,7 @@ class Runner(OnPolicyRunner):
         self.meta = meta
         self._fuse()
         self.last_iteration = self.updates = 0
+        self.anneal = 0.0
         self.logger.git_status_repos.clear()  # it looks for its own repository and says that there is none
         self.table = LiveTable(self)
         self._log = self.logger.log
@@ -110,6 +111,14 @@ class Runner(OnPolicyRunner):
         if "cuda" in rng and self.device.startswith("cuda"):
             torch.cuda.set_rng_state(rng["cuda"].cpu(), self.device)
 
+    def set_learning_rate(self, iteration: int) -> None:
+        """That of an iteration: as configured, and falling to almost nothing over the last ones."""
+        left = (self.last_iteration - iteration) / max(1.0, self.anneal * self.last_iteration)
+        rate = self.cfg["algorithm"]["learning_rate"] * min(1.0, max(0.01, left))
+        self.alg.learning_rate = rate
+        for group in self.alg.optimizer.param_groups:
+            group["lr"] = rate
+
     def _fuse(self) -> None:
         """Let the optimiser update all of its parameters in one pass: a third of the time on a CPU."""
         for group in self.alg.optimizer.param_groups:
@@ -117,6 +126,7 @@ class Runner(OnPolicyRunner):
 
     def _log_quietly(self, **kwargs: Any) -> None:
         self.updates += 1
+        self.set_learning_rate(kwargs["it"] + 1)
         if self.logger.disable_logs:
             return
         self.table.update(kwargs, self.logger.ep_extras)
