@@ -76,18 +76,18 @@ def main(args: Args) -> None:
         1, len(runs), figsize=(5 * len(runs), 3.4), sharey=True, squeeze=False, constrained_layout=True
     )
     for axis, run in zip(axes[0], runs, strict=True):
-        for tag, words in CURVES.items():
+        for number, (tag, words) in enumerate(CURVES.items()):
             if tag in run.lines:
                 steps, values = run.lines[tag]
-                axis.plot(steps * run.batch / 1e6, values, label=words)
+                axis.plot(steps * run.batch / 1e6, values, color=f"C{number}", label=words)
         steps, values = run.lines["/success/frontier"]
         axis.plot(steps * run.batch / 1e6, values, color="grey", linestyle=":", label="furthest open place")
         axis.set_title(run.mode)
         axis.set_xlabel("environment steps [million]")
         axis.set_ylim(-1.05, 1.05)
         axis.grid(alpha=0.3)
+        axis.legend(fontsize=8, loc="lower right")
     axes[0, 0].set_ylabel("share of episodes; place")
-    axes[0, -1].legend(fontsize=8, loc="lower right")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     save(figure, args.out)
     print(args.out)
