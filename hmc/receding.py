@@ -103,9 +103,10 @@ class Receding:
         """
         last = self.u if u is None else u
         start = make_start(self.task, self.sim, x, last, self.mode, self.memory, self.k, snapshot, self.ran)
-        known = None if self._known is None else self._known.since(1)
+        first = self._known is None
+        known = self._known.since(1) if self._known is not None and len(self._known) > 0 else None
         result = self._plan(
-            start, schedule=self.schedule, seed=(self.seed, self.k), forget=known is None, known=known
+            start, schedule=self.schedule, seed=(self.seed, self.k), forget=first, known=known
         )
         self._known = result.known
         action = self._run(result.schedule[0], start.x, start.u)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from hmc.cost import Cost
 from hmc.evaluate import Evaluator
-from hmc.schedule import Schedule
+from hmc.schedule import Schedule, SwitchSpace
 from hmc.start import make_start
-from tests.toy import Bad, Damp, Push, Ramp, ToySim, all_schedules, slow_cost, toy_task
+from tests.toy import COST, Bad, Damp, Push, Ramp, ToySim, all_schedules, slow_cost, toy_task
 
 X = [0.4, -0.2]
 
@@ -207,6 +207,16 @@ def test_every_beginning_is_rolled_out_once():
         torch.tensor([[0, 1, 2, 2, 1, 1], [0, 1, 0, 0, 0, 0], [0, 1, 0, 0, 1, 0], [1, 1, 2, 2, 1, 0]])
     )
     assert again.control_steps == 6 + 1 + (4 + 2) + 6
+
+
+def test_all_of_omega_takes_a_quarter_of_the_control_steps():
+    """The figure of docs/planner.md: T = 50, M = 3, nothing pruned, everything in one batch."""
+    task, space = toy_task(50, cost=Cost(COST.stage, COST.terminal)), SwitchSpace(3, 50)
+    rolled = evaluator(task, num_worlds=len(space))
+    incumbent = Schedule.constant(0, 50)
+    rolled.follow(incumbent)
+    rolled.costs(space.stitch(incumbent, torch.arange(len(space))))
+    assert 0.2 < rolled.control_steps / (50 * len(space)) < 0.25
 
 
 @settings(max_examples=80)

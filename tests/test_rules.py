@@ -112,6 +112,18 @@ def test_a_guard_bars_the_entry_and_only_that():
     assert running.cost(barred) < math.inf, "it is running already"
 
 
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_loop_goes_on_from_an_incumbent_that_may_not_run(exact):
+    """Nothing was recorded of it, so the next tick has nothing to take over."""
+    rules = Rules(guards={"ramp": lambda x, k: k > 2}, forbidden=[("ramp", "damp")])
+    for schedule in (["ramp"] * 6, ["ramp", "damp"] * 3):
+        loop, sim = Receding(ruled(rules), schedule=schedule, iterations=0), ToySim(1)
+        sim.reset(torch.tensor([FAR]), torch.zeros(1, 1))
+        for _ in range(4):
+            tick = loop.tick(sim.x()[0], snapshot=sim.save()[0] if exact else None)
+            sim.step(tick.u[None])
+
+
 def test_the_fallback_runs_where_nothing_else_may():
     def nowhere(x, k):
         return torch.zeros(len(x), dtype=torch.bool)
