@@ -204,6 +204,20 @@ def test_a_rollout_is_its_steps(sim):
     assert torch.equal(sim.save(), reached)
 
 
+def test_a_rollout_that_is_given_up_is_not_a_number():
+    """The engine stops a world that moves too fast, whose state is finite still."""
+    sim = made("mujoco-1")
+    restart(sim)
+    u = inputs(sim, 4).transpose(0, 1)
+    whole = rollout(sim, u, index(sim, 0, 1, 2, 3, 4))
+    x, others = start(sim), index(sim, 0, 1, 3, 4)
+    x[2, 20] = 1e12
+    sim.reset(x, rest(sim))
+    states = rollout(sim, u, index(sim, 0, 1, 2, 3, 4))
+    assert states[2].isnan().any()
+    assert torch.equal(states[others], whole[others])
+
+
 def test_a_step_of_none_does_nothing(sim):
     before = sim.save()
     sim.step(inputs(sim, 1)[0, :0], index(sim))

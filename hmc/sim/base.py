@@ -84,8 +84,8 @@ class Sim(Protocol):
 def rollout(sim: Sim, controls: Tensor, ids: Tensor) -> Tensor:
     """States after each control step under given inputs (n, H, nu) in worlds `ids` (n,), (n, H, nx).
 
-    Engines that can do it in one call have a method of this name; a world that diverges may there repeat
-    its last state.
+    Engines that can do it in one call have a method of this name. A world that the engine gives up is NaN
+    from there on.
     """
     if isinstance(sim, CanRollOut):
         return sim.rollout(controls, ids)

@@ -99,9 +99,11 @@ class MujocoSim:
         held = controls[order].repeat_interleave(self._substeps, 1).to(torch.float64)
         steps = held.shape[1]
         found = self.batch.rollout(steps, held.numpy(), record=("qpos", "qvel"), ids=ids[order].numpy())
-        last = slice(self._substeps - 1, None, self._substeps)
-        x = torch.cat([torch.from_numpy(found[part])[:, last] for part in ("qpos", "qvel")], 2)
-        return x[order.argsort()]
+        x = torch.cat([torch.from_numpy(found[part]) for part in ("qpos", "qvel")], 2)
+        # a world that the engine gave up repeats its last state, although it moves there
+        stuck = (x[:, 1:] == x[:, :-1]).all(2) & (x[:, 1:, self.model.nq :] != 0).any(2)
+        x[:, 1:][stuck] = torch.nan
+        return x[order.argsort(), self._substeps - 1 :: self._substeps]
 
     def save(self, ids: Tensor | None = None) -> Tensor:
         return self._row.clone() if ids is None else self._row[ids]
