@@ -31,7 +31,8 @@ class Plan:
         terms: its cost, term by term.
         incumbent: the schedule that the search began with.
         switches: accepted switches, in order; stitched onto `incumbent` they give `schedule`.
-        costs: the incumbent's cost, then the cost after each accepted switch (never rising, Theorem 1).
+        costs: the incumbent's cost, then the cost after each accepted switch, or pair of switches (never
+            rising, Theorem 1).
         seen: switches of `schedule` that were evaluated and do not improve it.
         space_size: Z, how many there are.
         draws: switches evaluated in the whole search, repeats included.
@@ -132,6 +133,7 @@ def plan(
     solver: str = "sample",
     samples: int = 64,
     order: str = "uniform",
+    pairs: int = 0,
     iterations: int | None = None,
     budget: Budget | None = None,
     tolerance: float = 1e-6,
@@ -163,6 +165,8 @@ def plan(
         samples: N, switches drawn a batch.
         order: of "sample"'s draws: "uniform", as Theorem 2 has it, or "tails": the switches that last to
             the end of the horizon first. Either way each switch comes once.
+        pairs: further draws that "sample" makes beside each batch, of two switches stitched at once (see
+            `Search.look_past`): what no single switch improves, two may. They do not count in `coverage`.
         iterations: at most this many switches are accepted; None for as many as improve.
         budget: limits on draws, control steps and seconds.
         tolerance: a switch counts if it lowers the cost by more than this share of it.
@@ -179,7 +183,7 @@ def plan(
     """
     _known("solver", solver, SOLVERS)
     _known("order", order, ORDERS)
-    _check(samples, iterations, tolerance)
+    _check(samples, pairs, iterations, tolerance)
     size = len(SwitchSpace(len(task.modes), task.horizon))
     sim = sim if sim is not None else task.make_sim(min(samples, size))
     if forget:
@@ -198,7 +202,9 @@ def plan(
     if start.mode is not None and not math.isfinite(meter.evaluator.follow(incumbent)):
         stay = Schedule.constant(start.mode, task.horizon, task.modes.names)
         incumbent = stay if math.isfinite(meter.evaluator.follow(stay)) else incumbent
-    search = Search(meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed), order)
+    search = Search(
+        meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed), order, pairs
+    )
     if progress is not None:
         search.report = lambda search: progress(_plan(search, incumbent))
     try:
@@ -258,9 +264,11 @@ def _known(what: str, name: str, names: Mapping[str, object]) -> None:
         raise ValueError(f"unknown {what} {name!r}: expected one of {', '.join(names)}{hint}")
 
 
-def _check(samples: int, iterations: int | None, tolerance: float) -> None:
+def _check(samples: int, pairs: int, iterations: int | None, tolerance: float) -> None:
     if samples < 1:
         raise ValueError(f"samples must be at least 1 switch a batch, got {samples}")
+    if pairs < 0:
+        raise ValueError(f"pairs must be >= 0 draws beside each batch, got {pairs}")
     if iterations is not None and iterations < 0:
         raise ValueError(f"iterations must be >= 0, or None for no limit, got {iterations}")
     if not 0 <= tolerance < math.inf:

@@ -53,7 +53,7 @@ class Receding:
         seed: of the draws; each tick draws from (seed, k).
         k: control step of the first tick.
         sim: simulator to plan in; made once if left out.
-        solver, samples, order, iterations, budget, tolerance, progress: as in `plan`, for every tick.
+        solver, samples, order, pairs, iterations, budget, tolerance, progress: as in `plan`, for every tick.
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class Receding:
         solver: str = "sample",
         samples: int = 64,
         order: str = "uniform",
+        pairs: int = 0,
         iterations: int | None = None,
         budget: Budget | None = None,
         tolerance: float = 1e-6,
@@ -86,6 +87,7 @@ class Receding:
             solver=solver,
             samples=samples,
             order=order,
+            pairs=pairs,
             iterations=iterations,
             budget=budget,
             tolerance=tolerance,

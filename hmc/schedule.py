@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -203,21 +204,42 @@ class Draws:
         return torch.tensor(drawn, dtype=torch.long)
 
 
+def tails(space: SwitchSpace, k: int, position: int) -> list[Switch]:
+    """The switches that last to the end of the horizon, once each, spread evenly over modes and moments.
+
+    They follow an additive recurrence with a step near the golden section. A moment keeps its place in it
+    from one control step to the next.
+
+    Args:
+        space: Omega, of M modes and T steps.
+        k: control step at which the horizon begins.
+        position: where in the sequence to begin.
+    """
+    size, horizon = space.num_modes * space.horizon, space.horizon
+    step = next(s for s in range(max(1, round(0.618 * size)), 2 * size) if math.gcd(s, size) == 1)
+    slots = (position + np.arange(size)) * step % size
+    modes, starts = slots // horizon, (slots % horizon - k) % horizon
+    return [Switch(m, mu, horizon - mu) for m, mu in zip(modes.tolist(), starts.tolist(), strict=True)]
+
+
 class TailsFirst:
-    """Every switch once: those that last to the end of the horizon first, then the rest, both shuffled.
+    """Every switch once: those that last to the end of the horizon first, then the rest, shuffled.
 
     Once a plan exists it is mostly the moment of handing over that is wrong, and the M T switches that
-    hand over for good are few beside the Z of all. The interface is that of `Draws`.
+    hand over for good are few beside the Z of all. They come in the order of `tails`: searches that
+    draw n of them each, at positions n apart, come to all of them before they come to any again. The
+    interface is that of `Draws`.
+
+    Args:
+        space: Omega.
+        rng: shuffles the rest.
+        k: control step at which the horizon begins.
+        position: where in the order of the tails to begin.
     """
 
-    def __init__(self, space: SwitchSpace, rng: np.random.Generator):
+    def __init__(self, space: SwitchSpace, rng: np.random.Generator, k: int = 0, position: int = 0):
         self._space = space
-        tails = [
-            space.index(Switch(mode, start, space.horizon - start))
-            for mode in range(space.num_modes)
-            for start in range(space.horizon)
-        ]
-        self._tails = rng.permutation(tails)
+        self._tails = np.array([space.index(tail) for tail in tails(space, k, position)])
         self._rest = Draws(len(space), rng)
         self.left = len(space)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hmc.budget import Meter
 from hmc.evaluate import Evaluator
-from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
+from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst, tails
 
 
 @dataclass
@@ -27,8 +27,9 @@ class Search:
         tolerance: a switch counts only when it lowers the cost by more than this share of it.
         rng: where draws come from.
         order: of the draws, one of ORDERS.
+        pairs: draws beside each batch that stitch two switches at once.
         report: told after every batch and accepted switch; False ends the search.
-        costs: the incumbent's cost, then the cost after each accepted switch.
+        costs: the incumbent's cost, then the cost after each accepted switch or pair.
         switches: accepted switches.
         seen: how many switches of `schedule` were evaluated and do not improve it.
         stopped_by: why the search ended; None while it runs.
@@ -41,12 +42,13 @@ class Search:
     tolerance: float
     rng: np.random.Generator
     order: str = "uniform"
+    pairs: int = 0
     report: Callable[[Search], bool | None] = lambda _: None
     costs: list[float] = field(default_factory=list)
     switches: list[Switch] = field(default_factory=list)
     seen: int = 0
     stopped_by: str | None = None
-    _found: tuple[int, float] | None = None
+    _found: tuple[tuple[Switch, ...], float] | None = None
 
     def __post_init__(self) -> None:
         self.space = SwitchSpace(len(self.evaluator.task.modes), len(self.schedule))
@@ -59,6 +61,11 @@ class Search:
             return self._found[1]
         cost = self.costs[-1]
         return cost - self.tolerance * abs(cost) if math.isfinite(cost) else cost
+
+    @property
+    def found(self) -> bool:
+        """Whether there is something to accept."""
+        return self._found is not None
 
     def batches(self, order: Draws | TailsFirst | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
         """Switches of Omega in an order, N at a time: indices and costs, (n,) each; inf if not known."""
@@ -81,20 +88,41 @@ class Search:
                 return
             self.tell()
 
-    def offer(self, index: Tensor, cost: Tensor) -> bool:
-        """Take note of a switch if it is below `bound`."""
-        if not float(cost) < self.bound:
-            return False
-        self._found = int(index), float(cost)
-        return True
+    def offer(self, indices: Sequence[int], cost: float) -> None:
+        """Take note of one switch, or of some that are stitched one after the other, if below `bound`."""
+        if cost < self.bound:
+            self._found = tuple(self.space[index] for index in indices), cost
+
+    def look_past(self) -> None:
+        """Try switches of a schedule that itself may be worse: a tail, and tails of other modes after it.
+
+        Handing over by way of a third mode takes two switches, of which the first alone need not improve.
+        """
+        position = self.evaluator.start.k + len(self.switches)
+        order = tails(self.space, self.evaluator.start.k, position)
+        first = next((tail for tail in order if tail.duration > 1), None)
+        room, _ = self.meter.room(self.pairs)
+        if first is None or room <= 0:
+            return
+        later = [tail for tail in order if tail.start > first.start and tail.mode != first.mode][:room]
+        if not later:
+            return
+        indices = torch.tensor([self.space.index(tail) for tail in later])
+        stop = None if self.meter.budget.seconds is None else self.meter.expired
+        rows = self.space.stitch(self.schedule.stitch(first), indices)
+        costs = self.evaluator.costs(rows, self.bound, stop)
+        self.meter.draws += int((~costs.isnan()).sum())
+        best = costs.nan_to_num(math.inf).argmin()
+        self.offer([self.space.index(first), int(indices[best])], float(costs[best]))
 
     def accept(self) -> bool:
         """Go on from the switch taken note of: K_def <- (m, mu, nu) u K_def. False if there is none."""
         if self._found is None:
             return False
-        index, cost = self._found
-        self.switches.append(self.space[index])
-        self.schedule = self.schedule.stitch(self.switches[-1])
+        switches, cost = self._found
+        for switch in switches:
+            self.schedule = self.schedule.stitch(switch)
+        self.switches += switches
         self.costs.append(cost)
         self.seen, self._found = 0, None
         return True
@@ -110,10 +138,13 @@ def sample(search: Search) -> None:
 
     The batch's best is taken, not its first: the whole batch has been rolled out by then.
     """
-    draws = ORDERS[search.order](search.space, search.rng)
+    draws = ORDERS[search.order](search)
     for indices, costs in search.batches(draws):
         best = costs.argmin()
-        if search.offer(indices[best], costs[best]):
+        search.offer([int(indices[best])], float(costs[best]))
+        if search.pairs:
+            search.look_past()
+        if search.found:
             return
 
 
@@ -121,12 +152,17 @@ def exhaustive(search: Search) -> None:
     """Problem 5 solved exactly: the best of all of Omega; of equal ones, that of lowest index."""
     for indices, costs in search.batches(InOrder(len(search.space))):
         best = costs.argmin()
-        search.offer(indices[best], costs[best])
+        search.offer([int(indices[best])], float(costs[best]))
 
 
-ORDERS: dict[str, Callable[[SwitchSpace, np.random.Generator], Draws | TailsFirst]] = {
-    "uniform": lambda space, rng: Draws(len(space), rng),
-    "tails": TailsFirst,
+def _tails(search: Search) -> TailsFirst:
+    k = search.evaluator.start.k
+    return TailsFirst(search.space, search.rng, k, k * search.samples + search.meter.draws)
+
+
+ORDERS: dict[str, Callable[[Search], Draws | TailsFirst]] = {
+    "uniform": lambda search: Draws(len(search.space), search.rng),
+    "tails": _tails,
 }
 SOLVERS: dict[str, Callable[[Search], None]] = {"sample": sample, "exhaustive": exhaustive}
 

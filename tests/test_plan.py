@@ -27,11 +27,12 @@ FAR = [1.5, 1.0]
     draws=st.none() | st.integers(1, 80),
     seed=st.integers(0, 9),
     order=st.sampled_from(["uniform", "tails"]),
+    pairs=st.sampled_from([0, 1, 20]),
 )
 @settings(max_examples=40)
-def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, order):
+def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, order, pairs):
     task = toy_task(5)
-    options = {"solver": solver, "samples": samples, "seed": seed, "order": order}
+    options = {"solver": solver, "samples": samples, "seed": seed, "order": order, "pairs": pairs}
     result = plan(task, x, schedule=incumbent, budget=Budget(draws=draws), **options)
     assert result.incumbent.modes == tuple(incumbent)
     assert result.incumbent_cost == slow_cost(task, incumbent, x)
@@ -42,7 +43,9 @@ def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, or
     for switch in result.switches:
         stitched = stitched.stitch(switch)
     assert stitched == result.schedule
-    assert len(result.costs) == len(result.switches) + 1
+    accepted = len(result.costs) - 1
+    assert accepted <= len(result.switches) <= (2 if pairs else 1) * accepted
+    assert all(b < a for a, b in pairwise(result.costs))
     assert result.space_size == 45
     assert result.draws >= result.rollouts - 1
     assert result.stopped_by == ("converged" if result.locally_optimal else "draws")
@@ -279,6 +282,7 @@ BAD = {
         "unknown order 'tail': expected one of uniform, tails; did",
     ),
     "no samples": ({"samples": 0}, ValueError, "samples must be at least 1"),
+    "fewer pairs than none": ({"pairs": -1}, ValueError, "pairs must be >= 0"),
     "iterations": ({"iterations": -1}, ValueError, "iterations must be >= 0"),
     "tolerance": ({"tolerance": math.nan}, ValueError, "tolerance must be a finite share"),
     "step": ({"k": -1}, ValueError, "control step k must be >= 0"),

@@ -13,7 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst, batch
+from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst, batch, tails
 
 NAMES = ("foot", "jump", "hand")
 modes = st.lists(st.integers(0, 2), min_size=1, max_size=30)
@@ -194,3 +194,25 @@ def test_tails_first_takes_every_switch_once_and_the_tails_before_the_rest(num_m
         taken += draws.take(n).tolist()
     assert sorted(taken) == list(range(len(space)))
     assert all(space[i].stop == horizon for i in taken[: num_modes * horizon])
+
+
+@given(num_modes=st.integers(1, 4), horizon=st.integers(2, 30), n=st.integers(1, 9), first=st.integers(0, 99))
+def test_searches_in_a_row_come_to_every_handover_before_they_come_to_one_again(num_modes, horizon, n, first):
+    """A handover is a mode and the control step at which it takes over for good, modulo the horizon."""
+    space = SwitchSpace(num_modes, horizon)
+    size = num_modes * horizon
+    seen = []
+    for k in range(first, first + size // n):
+        taken = TailsFirst(space, np.random.default_rng(k), k, k * n).take(n).tolist()
+        seen += [(space[i].mode, (k + space[i].start) % horizon) for i in taken]
+    assert len(seen) == len(set(seen)) == size - size % n
+
+
+def test_tails_are_spread_over_the_horizon():
+    """Any 20 in a row leave no gap longer than a fifth of the horizon, and no mode less than a quarter."""
+    space = SwitchSpace(3, 75)
+    order = tails(space, 0, 0)
+    for i in range(0, len(order) - 20, 20):
+        moments = sorted(tail.start for tail in order[i : i + 20])
+        assert max(b - a for a, b in pairwise([0, *moments, 75])) <= 15
+        assert min(sum(tail.mode == m for tail in order[i : i + 20]) for m in range(3)) >= 5

@@ -143,3 +143,14 @@ def test_theorem_2_z_over_n_batches_always_hold_it(seed, samples):
     batches = math.ceil(len(space) / samples)
     result = plan(task, [0.0, 0.0], samples=samples, seed=seed, budget=Budget(draws=batches * samples))
     assert result.switches == (space[index],)
+
+
+def test_a_pair_gets_past_what_no_single_switch_improves():
+    task, x, incumbent = random_task(57, 6)
+    stuck = plan(task, x, schedule=incumbent, solver="exhaustive")
+    assert stuck.locally_optimal
+    assert plan(task, x, schedule=stuck.schedule, samples=200).cost == stuck.cost
+    freed = plan(task, x, schedule=stuck.schedule, pairs=40)
+    assert len(freed.switches) == 2
+    assert freed.costs == (stuck.cost, freed.cost)
+    assert freed.cost == min(brute_force(task, x).values()) < stuck.cost

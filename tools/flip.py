@@ -43,12 +43,14 @@ class SearchCfg:
     Attributes:
         samples: switches drawn a batch.
         order: of the draws, see `hmc.plan`.
+        pairs: further draws beside each batch, of two switches at once.
         draws: switches that a tick's search may draw.
         control_steps: control steps that it may roll out.
     """
 
     samples: int = 16
     order: str = "tails"
+    pairs: int = 8
     draws: int = 16
     control_steps: int = 8000
 
@@ -159,6 +161,7 @@ def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
         schedule=["foot"] * task.horizon,
         samples=cfg.search.samples,
         order=cfg.search.order,
+        pairs=cfg.search.pairs,
         budget=Budget(draws=cfg.search.draws, control_steps=cfg.search.control_steps),
     )
     steps = round(cfg.seconds / world.dt)
