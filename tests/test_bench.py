@@ -56,7 +56,11 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
             "task.horizon=8",
             "search.control_steps=16",
         )
-        small = ("task.jump.mppi.samples=2", "task.jump.mppi.horizon=20", "task.jump.mppi.worlds=4")
+        small = (
+            "task.jump.sampling.samples=2",
+            "task.jump.sampling.horizon=20",
+            "task.jump.sampling.worlds=4",
+        )
         args = Planner(**{**vars(args), "set": names + small})
         expected = expected | {"go2_tick_ms_p50", "go2_tick_ms_p99", "go2_control_steps_fraction"}
 

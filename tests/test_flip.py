@@ -23,8 +23,8 @@ from tools.random_policy import write_random_policy
 
 SHORT = (
     *("seconds=0.2", "task.horizon=6", "task.command=5", "search.samples=4", "search.control_steps=100"),
-    *("task.jump.mppi.horizon=4", "task.jump.mppi.knots=3", "task.jump.mppi.samples=3"),
-    *("task.jump.mppi.replan_every=2", "task.jump.mppi.worlds=12"),
+    *("task.jump.sampling.horizon=4", "task.jump.sampling.knots=3", "task.jump.sampling.samples=3"),
+    *("task.jump.sampling.replan_every=2", "task.jump.sampling.worlds=12"),
 )
 STEPS = 10
 SUMMARY = {
@@ -181,7 +181,7 @@ def test_an_unknown_key(overrides, capsys):
     ("item", "message"),
     [
         ("task.horizon=0", "horizon must be at least 1 control step, got 0"),
-        ("task.jump.mppi.samples=0", "mppi.samples must be at least 1, got 0"),
+        ("task.jump.sampling.samples=0", "sampling.samples must be at least 1, got 0"),
         ("task.foot=gone.onnx", "policy gone.onnx: no such file"),
     ],
 )

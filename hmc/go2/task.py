@@ -16,7 +16,7 @@ from hmc.go2 import model as go2
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.modes import ModeSet
-from hmc.mppi import Mppi, MppiCfg
+from hmc.sampling import SamplingCfg, SamplingMpc
 from hmc.sim.base import Sim
 from hmc.sim.mujoco import MujocoSim
 from hmc.task import Task
@@ -51,7 +51,7 @@ class JumpCfg:
     """The jump mode.
 
     Attributes:
-        mppi: the sampler's settings.
+        sampling: the sampler's settings.
         cost: what its rollouts are judged by; the target is always the handstand.
         spacing: control steps between the points of the guess.
         guess: points (front thigh, front calf, rear thigh, rear calf) [rad] that the plan starts from,
@@ -60,7 +60,7 @@ class JumpCfg:
         hip: noise of the hip joints relative to the others.
     """
 
-    mppi: MppiCfg = field(default_factory=MppiCfg)
+    sampling: SamplingCfg = field(default_factory=SamplingCfg)
     cost: CostCfg = field(default_factory=CostCfg)
     spacing: int = 8
     guess: tuple[tuple[float, ...], ...] = ()
@@ -151,7 +151,7 @@ def policy_path(name: str, given: str = "") -> Path:
     return Path(given) if given else Path(str(resources.files("hmc.go2") / "policies" / f"{name}.onnx"))
 
 
-def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Mppi:
+def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> SamplingMpc:
     """The jump: MPPI towards the handstand, its noise mostly left-right symmetric."""
     symmetric = torch.zeros(4, 12)
     for row, joint in enumerate((1, 2, 7, 8)):
@@ -160,9 +160,9 @@ def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Mppi:
     guess = None
     if cfg.guess:
         guess = dense_guess(torch.tensor(cfg.guess, dtype=torch.float64), cfg.spacing)
-    return Mppi(
+    return SamplingMpc(
         "jump",
-        cfg.mppi,
+        cfg.sampling,
         make_sim,
         stance_cost(cfg.cost, lambda k: torch.ones_like(k, dtype=torch.bool)),
         go2.Q_LOWER.double(),

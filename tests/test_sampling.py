@@ -1,4 +1,4 @@
-"""MPPI as a mode: against a loop written out by hand, and what batches, memory and NaN may not change."""
+"""Sampling MPC: against loops written out by hand, and what batches, memory and NaN may not change."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from hmc import Budget, Cost, ModeSet, Task, plan
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import JumpCfg, jump_mode, make_sim
-from hmc.mppi import Mppi, MppiCfg
+from hmc.sampling import METHODS, SamplingCfg, SamplingMpc
 
 A = torch.tensor([[1.0, 0.1], [-0.2, 0.9]], dtype=torch.float64)
 
@@ -60,10 +60,12 @@ COST = Cost(
 )
 
 
-def mode(make: Callable[[int], Any] = Linear, seed: int = 3, guess: Tensor | None = None, **cfg: Any) -> Mppi:
+def mode(
+    make: Callable[[int], Any] = Linear, seed: int = 3, guess: Tensor | None = None, **cfg: Any
+) -> SamplingMpc:
     settings = {"horizon": 6, "samples": 8, "knots": 3, "noise": 0.5, "replan_every": 2, "worlds": 16, **cfg}
     bound = torch.full((2,), 1.5, dtype=torch.float64)
-    return Mppi("mppi", MppiCfg(**settings), make, COST, -bound, bound, guess=guess, seed=seed)
+    return SamplingMpc("mppi", SamplingCfg(**settings), make, COST, -bound, bound, guess=guess, seed=seed)
 
 
 def situations(n: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
@@ -78,22 +80,28 @@ def interpolated(points: Tensor, at: float) -> Tensor:
     return points[low] + (at - low) * (points[low + 1] - points[low])
 
 
-def by_hand(mppi: Mppi, x: Tensor, u: Tensor, theta: Tensor, k: int) -> Tensor:
-    """One re-plan from knots theta (K, nu), sample by sample and step by step."""
-    cfg = mppi.cfg
-    eps = mppi._noise(torch.tensor([k]), 0)[0]
+def cost_by_hand(cfg: SamplingCfg, x: Tensor, u: Tensor, plans: Tensor, k: int) -> list[float]:
+    """J of plans (S, K, nu), sample by sample and step by step."""
     costs = []
-    for sample in range(cfg.samples):
+    for knots in plans:
         sim, last, total = Linear(1), u[None], 0.0
         sim.reset(x[None], last)
         for i in range(cfg.horizon):
-            control = interpolated(theta + eps[sample], i * (cfg.knots - 1) / (cfg.horizon - 1))
+            control = interpolated(knots, i * (cfg.knots - 1) / (cfg.horizon - 1))
             control = control.clamp(-1.5, 1.5)[None]
             at = torch.tensor([k + i])
             total += float(sum(f(sim.x(), control, last, at) for f in COST.stage.values())) * sim.dt
             sim.step(control)
             last = control
         costs.append(total + float(COST.terminal["end"](sim.x(), torch.tensor([k + cfg.horizon]))))
+    return costs
+
+
+def by_hand(mppi: SamplingMpc, x: Tensor, u: Tensor, theta: Tensor, k: int) -> Tensor:
+    """One MPPI re-plan from knots theta (K, nu)."""
+    cfg = mppi.cfg
+    eps = cfg.noise * mppi._noise(torch.tensor([k]), 0)[0]
+    costs = cost_by_hand(cfg, x, u, theta + eps, k)
     best = min(costs)
     spread = math.sqrt(sum((cost - best) ** 2 for cost in costs) / len(costs))
     weights = [math.exp(-(cost - best) / (cfg.temperature * spread)) for cost in costs]
@@ -112,6 +120,57 @@ def test_replan_against_the_loop():
         torch.testing.assert_close(after[row, :-1].reshape(3, 2), theta)
         torch.testing.assert_close(action[row], theta[0].clamp(-1.5, 1.5))
     assert after[:, -1].tolist() == [1.0] * 5
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_predictive_sampling_takes_the_best_sample(iterations):
+    ps = mode(method="ps", iterations=iterations)
+    x, u, k = situations(4)
+    after = ps.act(x, u, ps.reset(x, u, k), k)[1]
+    for row in range(4):
+        theta, costs = u[row].expand(3, 2), []
+        for i in range(iterations):
+            plans = theta + ps.cfg.noise * ps._noise(k[row : row + 1], i)[0]
+            costs = cost_by_hand(ps.cfg, x[row], u[row], plans, int(k[row]))
+            theta = plans[costs.index(min(costs))]
+        torch.testing.assert_close(after[row, :-1].reshape(3, 2), theta)
+
+
+def test_cem_fits_mean_and_spread_to_the_elites():
+    cem = mode(method="cem", iterations=2, elites=3)
+    x, u, k = situations(4)
+    after = cem.act(x, u, cem.reset(x, u, k), k)[1]
+    for row in range(4):
+        theta, std = u[row].expand(3, 2), torch.full((3, 2), cem.cfg.noise, dtype=torch.float64)
+        for i in range(2):
+            plans = theta + std * cem._noise(k[row : row + 1], i)[0]
+            costs = torch.tensor(cost_by_hand(cem.cfg, x[row], u[row], plans, int(k[row])))
+            elites = plans[costs.argsort()[:3]]
+            theta, std = elites.mean(0), elites.std(0, correction=0).clamp(min=0.05 * cem.cfg.noise)
+        torch.testing.assert_close(after[row, :-1].reshape(3, 2), theta)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_planner_on_its_own_keeps_to_its_budget_and_gets_better_with_it(method):
+    x, u, _ = situations(1)
+    costs = []
+    for budget in (1, 48 * 5, 48 * 60):
+        alone = mode(method=method, elites=3)
+        solution = alone.solve(x[0], u[0], budget, k=3)
+        assert solution.control_steps == alone.control_steps == max(48, budget)
+        assert solution.controls.shape == (6, 2)
+        sim, last, total = Linear(1), u[:1], 0.0
+        sim.reset(x, last)
+        for i, control in enumerate(solution.controls[:, None]):
+            at = torch.tensor([3 + i])
+            total += float(sum(f(sim.x(), control, last, at) for f in COST.stage.values())) * sim.dt
+            sim.step(control)
+            last = control
+        total += float(COST.terminal["end"](sim.x(), torch.tensor([9])))
+        assert solution.cost == pytest.approx(total, rel=1e-12)
+        costs.append(solution.cost)
+    assert costs[0] >= costs[1] >= costs[2]
+    assert costs[2] < costs[0]
 
 
 def test_the_plan_runs_open_loop_between_replans():
@@ -171,7 +230,7 @@ def test_cold_takes_the_best_sample_and_hot_the_mean():
     x, u, k = situations(3)
     start = u[:, None].expand(3, 3, 2)
     cold, hot = mode(temperature=0.0), mode(temperature=1e9)
-    eps = cold._noise(k, 0)
+    eps = cold.cfg.noise * cold._noise(k, 0)
     costs = cold._rollout(x, u, start[:, None] + eps, k)
     best = eps[torch.arange(3), costs.argmin(1)]
     torch.testing.assert_close(
@@ -206,10 +265,13 @@ def test_noise_depends_on_seed_and_step_alone():
 def test_the_basis_shapes_the_noise():
     bound = torch.ones(2, dtype=torch.float64)
     together = torch.tensor([[1.0, -2.0]], dtype=torch.float64)
-    mppi = Mppi("m", MppiCfg(horizon=4, knots=2, samples=50), Linear, COST, -bound, bound, basis=together)
-    eps = mppi._noise(torch.tensor([0]), 0)
-    torch.testing.assert_close(eps[..., 1], -2 * eps[..., 0])
-    assert eps[0, 1:, :, 0].std() == pytest.approx(mppi.cfg.noise, rel=0.3)
+    mppi = SamplingMpc(
+        "m", SamplingCfg(horizon=4, knots=2, samples=50), Linear, COST, -bound, bound, basis=together
+    )
+    z = mppi._noise(torch.tensor([0]), 0)
+    assert z.shape == (1, 50, 2, 1)
+    torch.testing.assert_close(mppi._along_basis(z), torch.cat([z, -2 * z], -1))
+    assert z[0, 1:].std() == pytest.approx(1.0, rel=0.3)
 
 
 def test_memo_and_budget():
@@ -238,7 +300,7 @@ def test_equal_situations_in_one_batch_are_rolled_out_once():
 
 
 def test_the_memo_does_not_grow_for_ever(monkeypatch):
-    monkeypatch.setattr(Mppi, "MEMO", 4)
+    monkeypatch.setattr(SamplingMpc, "MEMO", 4)
     mppi = mode()
     x, u, k = situations(10)
     action, _ = mppi.act(x, u, mppi.reset(x, u, k), k)
@@ -256,18 +318,20 @@ def test_a_plan_counts_what_its_modes_roll_out():
     assert plan(task, [1.0, 0.0], samples=4, sim=Linear(4)).control_steps == result.control_steps
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("worlds", [1, 7, 16, 200])
-def test_batches_do_not_change_actions(worlds):
+def test_batches_do_not_change_actions(worlds, method):
     """Alone, in any order, in a simulator of any size: the same to the bit."""
     x, u, k = situations(13)
-    whole = mode()
+    settings = {"method": method, "iterations": 2, "elites": 3}
+    whole = mode(**settings)
     action, memory = whole.act(x, u, whole.reset(x, u, k), k)
-    other = mode(worlds=worlds)
+    other = mode(worlds=worlds, **settings)
     order = torch.randperm(13)
     shuffled, _ = other.act(x[order], u[order], other.reset(x, u, k)[order], k[order])
     assert torch.equal(shuffled, action[order])
     for row in range(13):
-        single = mode(worlds=worlds)
+        single = mode(worlds=worlds, **settings)
         one = slice(row, row + 1)
         alone, after = single.act(x[one], u[one], single.reset(x[one], u[one], k[one]), k[one])
         assert torch.equal(alone, action[one])
@@ -280,10 +344,10 @@ def test_batches_do_not_change_the_jump():
     x = FOOTSTAND.state().repeat(n, 1)
     x[:, 7:] += 0.05 * torch.randn(n, 30, dtype=torch.float64)
     u, k = x[:, 7:19].clone(), torch.arange(n) % 3
-    settings = MppiCfg(horizon=6, samples=5, knots=3, noise=0.1, replan_every=2, worlds=64)
+    settings = SamplingCfg(horizon=6, samples=5, knots=3, noise=0.1, replan_every=2, worlds=64)
 
     def jump(worlds: int):
-        cfg = JumpCfg(mppi=MppiCfg(**{**vars(settings), "worlds": worlds}))
+        cfg = JumpCfg(sampling=SamplingCfg(**{**vars(settings), "worlds": worlds}))
         return jump_mode(cfg, lambda count: make_sim(count, threads=1), seed=1)
 
     whole, parts = jump(64), jump(4)
@@ -298,13 +362,23 @@ def test_batches_do_not_change_the_jump():
         memory = after
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_where_every_sample_diverges_the_plan_stays(method):
+    mpc = mode(lambda n: Linear(n, edge=1.0), method=method, elites=3, iterations=2)
+    x, u = torch.tensor([[5.0, 0.0]]).double(), torch.tensor([[0.3, -0.2]]).double()
+    action, after = mpc.act(x, u, mpc.reset(x, u, torch.tensor([0])), torch.tensor([0]))
+    assert torch.equal(action, u)
+    torch.testing.assert_close(after[:, :-1].reshape(3, 2), u.expand(3, 2))
+    assert mpc.solve(x[0], u[0], 100).cost == math.inf
+
+
 def test_a_sample_that_diverges_has_no_say():
     """Samples that end in NaN weigh nothing; a situation whose samples all do keeps its plan."""
     x = torch.tensor([[0.0, 0.0], [0.9, 0.0], [5.0, 0.0]], dtype=torch.float64)
     u, k = torch.zeros(3, 2, dtype=torch.float64), torch.zeros(3, dtype=torch.long)
     risky, safe = mode(lambda n: Linear(n, edge=1.0)), mode()
     start = u[:, None].expand(3, 3, 2)
-    costs = risky._rollout(x, u, start[:, None] + risky._noise(k, 0), k)
+    costs = risky._rollout(x, u, start[:, None] + risky.cfg.noise * risky._noise(k, 0), k)
     lost = costs.isnan().sum(1)
     assert lost[0] < 8
     assert 0 < lost[1] < 8
@@ -322,19 +396,21 @@ def test_a_sample_that_diverges_has_no_say():
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"horizon": 0}, "mppi.horizon must be at least 1, got 0"),
-        ({"samples": 0}, "mppi.samples must be at least 1, got 0"),
-        ({"replan_every": 0}, "mppi.replan_every must be at least 1, got 0"),
-        ({"iterations": 0}, "mppi.iterations must be at least 1, got 0"),
-        ({"worlds": -1}, "mppi.worlds must be at least 1, got -1"),
-        ({"knots": 1}, "mppi.knots must be between 2 and the horizon 20, got 1"),
-        ({"knots": 21}, "mppi.knots must be between 2 and the horizon 20, got 21"),
-        ({"replan_every": 21}, "mppi.replan_every must not exceed the horizon 20, got 21"),
-        ({"temperature": -0.1}, "mppi.temperature must be a number >= 0, got -0.1"),
-        ({"temperature": math.nan}, "mppi.temperature must be a number >= 0, got nan"),
-        ({"noise": -1.0}, "mppi.noise must be a number >= 0, got -1.0"),
+        ({"horizon": 0}, "sampling.horizon must be at least 1, got 0"),
+        ({"samples": 0}, "sampling.samples must be at least 1, got 0"),
+        ({"replan_every": 0}, "sampling.replan_every must be at least 1, got 0"),
+        ({"iterations": 0}, "sampling.iterations must be at least 1, got 0"),
+        ({"worlds": -1}, "sampling.worlds must be at least 1, got -1"),
+        ({"knots": 1}, "sampling.knots must be between 2 and the horizon 20, got 1"),
+        ({"knots": 21}, "sampling.knots must be between 2 and the horizon 20, got 21"),
+        ({"replan_every": 21}, "sampling.replan_every must not exceed the horizon 20, got 21"),
+        ({"temperature": -0.1}, "sampling.temperature must be a number >= 0, got -0.1"),
+        ({"temperature": math.nan}, "sampling.temperature must be a number >= 0, got nan"),
+        ({"noise": -1.0}, "sampling.noise must be a number >= 0, got -1.0"),
+        ({"method": "mpi"}, "sampling.method must be one of mppi, cem, ps, got 'mpi'"),
+        ({"method": "cem", "elites": 26}, "sampling.elites must not exceed the 25 samples, got 26"),
     ],
 )
 def test_bad_settings(setting, message):
     with pytest.raises(ValueError, match=message):
-        MppiCfg(**setting)
+        SamplingCfg(**setting)

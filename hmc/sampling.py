@@ -1,4 +1,4 @@
-"""Model predictive path integral control as a mode: a whole batch of worlds re-plans in one rollout."""
+"""Sampling MPC (MPPI, CEM, predictive sampling), as a mode and as a planner on its own."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from hmc.sim.base import Sim, rollout
 
 
 @dataclass(frozen=True)
-class MppiCfg:
-    """Settings of one MPPI mode.
+class SamplingCfg:
+    """Settings of one sampling MPC.
 
     Attributes:
+        method: how samples move the plan, one of METHODS: mppi, cem (cross-entropy method) or ps
+            (predictive sampling).
         horizon: control steps looked ahead, H.
-        samples: rollouts a re-plan, the nominal among them.
-        temperature: lambda of the weights, in units of the samples' cost spread.
+        samples: rollouts an update, the plan itself among them, S.
+        temperature: of mppi: lambda of the weights, in units of the samples' cost spread.
+        elites: of cem: how many of the best samples the next distribution is fitted to.
         knots: points of the linear spline that a plan is, over the horizon.
         noise: standard deviation of a knot's noise along each row of the noise basis.
         replan_every: control steps between re-plans; in between the plan runs open loop.
@@ -29,9 +32,11 @@ class MppiCfg:
         worlds: worlds of the simulator it plans in; larger batches are processed in parts.
     """
 
+    method: str = "mppi"
     horizon: int = 20
     samples: int = 25
     temperature: float = 0.1
+    elites: int = 5
     knots: int = 5
     noise: float = 0.2
     replan_every: int = 2
@@ -39,29 +44,96 @@ class MppiCfg:
     worlds: int = 256
 
     def __post_init__(self) -> None:
-        for name in ("horizon", "samples", "replan_every", "iterations", "worlds"):
+        if self.method not in METHODS:
+            raise ValueError(f"sampling.method must be one of {', '.join(METHODS)}, got {self.method!r}")
+        for name in ("horizon", "samples", "elites", "replan_every", "iterations", "worlds"):
             if getattr(self, name) < 1:
-                raise ValueError(f"mppi.{name} must be at least 1, got {getattr(self, name)}")
+                raise ValueError(f"sampling.{name} must be at least 1, got {getattr(self, name)}")
         for name in ("temperature", "noise"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"mppi.{name} must be a number >= 0, got {getattr(self, name)}")
+                raise ValueError(f"sampling.{name} must be a number >= 0, got {getattr(self, name)}")
+        if self.method == "cem" and self.elites > self.samples:
+            raise ValueError(f"sampling.elites must not exceed the {self.samples} samples, got {self.elites}")
         if not 2 <= self.knots <= self.horizon:
-            raise ValueError(f"mppi.knots must be between 2 and the horizon {self.horizon}, got {self.knots}")
+            raise ValueError(
+                f"sampling.knots must be between 2 and the horizon {self.horizon}, got {self.knots}"
+            )
         if self.replan_every > self.horizon:
             raise ValueError(
-                f"mppi.replan_every must not exceed the horizon {self.horizon}, got {self.replan_every}"
+                f"sampling.replan_every must not exceed the horizon {self.horizon}, got {self.replan_every}"
             )
 
 
-class Mppi(Mode):
-    r"""MPPI (Williams et al. 2017) on spline knots, batched over worlds and deterministic.
+Update = Callable[[SamplingCfg, Tensor, Tensor], tuple[Tensor, Tensor | None]]
 
-    A plan is K knots theta with u_i = sum_j B_ij theta_j. A re-plan draws eps_s (eps_0 = 0) from a
-    counter keyed by (seed, k), the same in every world, rolls out the plans theta + eps_s and sets
 
-    .. math:: \theta \leftarrow \theta + \sum_s w_s \epsilon_s, \quad
-              w_s \propto \exp(-(J_s - \min J) / (\lambda \sigma)), \quad
+def mppi(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor | None]:
+    r"""Model predictive path integral control (Williams et al. 2017): a weighted mean of all samples.
+
+    .. math:: w_s \propto \exp(-(J_s - \min J) / (\lambda \sigma)), \quad
               \sigma^2 = \mathrm{mean}_s (J_s - \min J)^2
+
+    Args:
+        cfg: settings.
+        noise: of the samples, (n, S, K, d), along the noise basis.
+        costs: J of the samples, (n, S); inf where one has no say.
+
+    Returns:
+        What the plan moves by, (n, K, d), and the noise's standard deviation in the re-plan's next
+        update, (n, K, d), or None where it stays as it is.
+    """
+    finite = costs.isfinite()
+    best = costs.min(1, keepdim=True).values
+    excess = torch.where(finite, costs - best, 0.0)
+    spread = (excess.square().sum(1, keepdim=True) / finite.sum(1, keepdim=True).clamp(min=1)).sqrt()
+    weight = torch.exp(-excess / (cfg.temperature * spread).clamp(min=1e-9)) * finite
+    weight = weight / weight.sum(1, keepdim=True).clamp(min=1e-9)
+    return (weight[:, :, None, None] * noise).sum(1), None
+
+
+def cem(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor | None]:
+    """The cross-entropy method (Rubinstein 1999): mean and standard deviation of the elites; as `mppi`."""
+    order = costs.argsort(dim=1, stable=True)[:, : cfg.elites]
+    has_say = costs.gather(1, order).isfinite()[:, :, None, None]
+    elites = noise.gather(1, order[:, :, None, None].expand(-1, -1, *noise.shape[2:])) * has_say
+    count = has_say.sum(1).clamp(min=1)
+    mean = elites.sum(1) / count
+    variance = ((elites - mean[:, None]).square() * has_say).sum(1) / count
+    # a distribution that has collapsed finds nothing any more
+    return mean, variance.sqrt().clamp(min=0.05 * cfg.noise)
+
+
+def ps(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Predictive sampling (Howell et al. 2022): the best sample; as `mppi`."""
+    best = costs.argmin(1)
+    has_say = costs.gather(1, best[:, None]).isfinite()[:, :, None]
+    return noise[torch.arange(len(noise), device=noise.device), best] * has_say, None
+
+
+METHODS: dict[str, Update] = {"mppi": mppi, "cem": cem, "ps": ps}
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What a planner of inputs came to.
+
+    Attributes:
+        controls: inputs, (H, nu).
+        cost: J of them; inf where every sample diverged.
+        control_steps: control steps rolled out.
+    """
+
+    controls: Tensor
+    cost: float
+    control_steps: int
+
+
+class SamplingMpc(Mode):
+    r"""Sampling MPC on spline knots, batched over worlds and deterministic.
+
+    A plan is K knots theta with u_i = sum_j B_ij theta_j. An update draws noise eps_s (eps_0 = 0) from a
+    counter keyed by (seed, k), the same in every world, rolls out the plans theta + eps_s, and moves theta
+    by what `cfg.method` makes of their costs J_s.
 
     Between re-plans the plan runs open loop; a re-plan starts from the plan shifted by the steps taken.
     Memory: the knots, then the number of steps taken since entry. The last `MEMO` re-plans are kept:
@@ -84,7 +156,7 @@ class Mppi(Mode):
     def __init__(
         self,
         name: str,
-        cfg: MppiCfg,
+        cfg: SamplingCfg,
         make_sim: Callable[[int], Sim],
         cost: Cost,
         lower: Tensor,
@@ -125,6 +197,28 @@ class Mppi(Mode):
 
     def forget(self) -> None:
         self._known.clear()
+
+    @torch.no_grad()
+    def solve(self, x: Tensor, u: Tensor, control_steps: int, k: int = 0) -> Solution:
+        """The planner on its own: updates from the first plan on, until the budget is used up.
+
+        Args:
+            x: state, (nx,).
+            u: input applied last, (nu,).
+            control_steps: budget; an update takes S H of them, and one at least is made.
+            k: control step since the start of the task.
+        """
+        step = torch.tensor([k], device=x.device)
+        theta = self.reset(x[None], u[None], step)[:, :-1].reshape(1, self.cfg.knots, self.nu)
+        std, best = None, (math.inf, theta[0])
+        updates = max(1, control_steps // (self.cfg.samples * self.cfg.horizon))
+        for iteration in range(updates):
+            theta, std, (plans, costs) = self._update(x[None], u[None], theta, std, step, iteration)
+            at = int(costs[0].argmin())
+            if float(costs[0, at]) < best[0]:
+                best = float(costs[0, at]), plans[0, at]
+        controls = (self.spline.to(x) @ best[1]).clamp(self.lower.to(x), self.upper.to(x))
+        return Solution(controls, best[0], updates * self.cfg.samples * self.cfg.horizon)
 
     def _prior(self, x: Tensor, steps: int) -> Tensor:
         """Knots of the guess from `steps` after entry on, (n, K, nu)."""
@@ -169,22 +263,30 @@ class Mppi(Mode):
         return plans
 
     def _replan(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
+        std = None
         for iteration in range(self.cfg.iterations):
-            eps = self._noise(k, iteration).to(x)
-            plans = theta[:, None] + eps
-            costs = self._rollout(x, u, plans, k)
-            costs = torch.nan_to_num(costs, nan=torch.inf)
-            best = costs.min(1, keepdim=True).values
-            finite = costs.isfinite()
-            excess = torch.where(finite, costs - best, 0.0)
-            spread = (excess.square().sum(1, keepdim=True) / finite.sum(1, keepdim=True).clamp(min=1)).sqrt()
-            weight = torch.exp(-excess / (self.cfg.temperature * spread).clamp(min=1e-9)) * finite
-            weight = weight / weight.sum(1, keepdim=True).clamp(min=1e-9)
-            theta = theta + (weight[:, :, None, None] * eps).sum(1)
+            theta, std, _ = self._update(x, u, theta, std, k, iteration)
         return theta
 
+    def _update(
+        self, x: Tensor, u: Tensor, theta: Tensor, std: Tensor | None, k: Tensor, iteration: int
+    ) -> tuple[Tensor, Tensor | None, tuple[Tensor, Tensor]]:
+        """Knots and standard deviation of the noise after one update; the plans tried and their costs."""
+        noise = self._noise(k, iteration).to(x) * (self.cfg.noise if std is None else std[:, None])
+        plans = theta[:, None] + self._along_basis(noise)
+        costs = torch.nan_to_num(self._rollout(x, u, plans, k), nan=torch.inf)
+        move, std = METHODS[self.cfg.method](self.cfg, noise, costs)
+        return theta + self._along_basis(move), std, (plans, costs)
+
+    def _along_basis(self, noise: Tensor) -> Tensor:
+        """Noise (..., d) as noise of the inputs, (..., nu); summed in one order, whatever the batch."""
+        inputs = noise.new_zeros(*noise.shape[:-1], self.nu)
+        for along, row in zip(noise.unbind(-1), self.basis.to(noise), strict=True):
+            inputs = inputs + along[..., None] * row
+        return inputs
+
     def _noise(self, k: Tensor, iteration: int) -> Tensor:
-        """Noise of each world's samples, (n, S, K, nu): a function of (seed, k, iteration) alone."""
+        """Standard normal noise of each world's samples, (n, S, K, d), by (seed, k, iteration) alone."""
         steps, inverse = k.unique(return_inverse=True)
         table = []
         for step in steps.tolist():
@@ -194,7 +296,7 @@ class Mppi(Mode):
                 self.cfg.samples, self.cfg.knots, len(self.basis), generator=generator, dtype=torch.float64
             )
             z[0] = 0
-            table.append(self.cfg.noise * z @ self.basis.double())
+            table.append(z)
         return torch.stack(table)[inverse.cpu()]
 
     def _rollout(self, x: Tensor, u: Tensor, plans: Tensor, k: Tensor) -> Tensor:
