@@ -104,15 +104,20 @@ class CartpoleSim:
     def step(self, u: Tensor, ids: Tensor | None = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
         row = self.save(ids)
-        x, force = row[:, :4], self.params.gear * u[:, 0].to(self.dtype)
+        u = u.to(self.dtype)
+        self.load(torch.cat([self.advance(row[:, :4], u), u, row[:, 5:] + self._dt], dim=1), ids)
+
+    def advance(self, x: Tensor, u: Tensor) -> Tensor:
+        """States (n, 4) one control step after x under inputs u (n, 1); differentiable."""
+        force = self.params.gear * u[:, 0]
         h = self._dt / self._substeps
         for _ in range(self._substeps):
             k1 = self._rate(x, force)
-            k2 = self._rate(x + h / 2 * k1, force)
-            k3 = self._rate(x + h / 2 * k2, force)
-            k4 = self._rate(x + h * k3, force)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        self.load(torch.cat([x, u.to(self.dtype), row[:, 5:] + self._dt], dim=1), ids)
+            k2 = self._rate(torch.add(x, k1, alpha=h / 2), force)
+            k3 = self._rate(torch.add(x, k2, alpha=h / 2), force)
+            k4 = self._rate(torch.add(x, k3, alpha=h), force)
+            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+        return x
 
     def save(self, ids: Tensor | None = None) -> Tensor:
         return self._rows.clone() if ids is None else self._rows[ids]
@@ -133,7 +138,8 @@ class CartpoleSim:
     def _rate(self, x: Tensor, force: Tensor) -> Tensor:
         theta, _, theta_dot, p_dot = x.unbind(1)
         c, sin, cos = self.params, theta.sin(), theta.cos()
-        swing = c.pole_length * theta_dot**2 - c.gravity * cos
-        p_ddot = (force + c.pole_mass * sin * swing) / (c.cart_mass + c.pole_mass * sin**2)
+        pull = c.pole_mass * sin  # the pole's mass along the rail, times what swings it
+        swing = c.pole_length * theta_dot.square() - c.gravity * cos
+        p_ddot = (force + pull * swing) / (c.cart_mass + pull * sin)
         theta_ddot = (c.gravity * sin - p_ddot * cos) / c.pole_length
         return torch.stack([theta_dot, p_dot, theta_ddot, p_ddot], dim=1)
