@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,20 +14,10 @@ from hmc.rollout import Rolled, roll
 from hmc.schedule import Schedule
 from hmc.sim.base import Sim
 from hmc.start import Start
+from hmc.table import Table
 from hmc.task import Task
 from hmc.trace import Trace, record, root
 from hmc.worlds import Worlds
-
-
-class _Known(NamedTuple):
-    """Cost and terms of a schedule; where it was pruned, a lower bound of the cost and no terms."""
-
-    cost: float
-    terms: list[float] | None
-
-    def answers(self, bound: float) -> bool:
-        """Whether this is all that a caller with this bound asks for."""
-        return self.terms is not None or self.cost > bound
 
 
 class Evaluator:
@@ -61,7 +51,7 @@ class Evaluator:
         self.trunk = root(self._worlds, start)
         if known is not None and known.meets(self.trunk):
             self.trunk = known
-        self._known: dict[bytes, _Known] = {}
+        self._table = Table(len(task.modes), len(task.cost.names))
 
     @property
     def control_steps(self) -> int:
@@ -86,14 +76,14 @@ class Evaluator:
                 f"schedules hold modes {int(schedules.min())} to {int(schedules.max())}: task "
                 f"{self.task.name!r} has 0 to {len(self.task.modes) - 1}"
             )
-        keys = self._keys(schedules)
+        keys = self._table.keys(schedules)
+        missing = np.flatnonzero(self._table.missing(self._table.find(keys), bound))
         todo: dict[bytes, int] = {}
-        for row, key in enumerate(keys):
-            known = self._known.get(key)
-            if known is None or not known.answers(bound):
-                todo.setdefault(key, row)
-        fresh, rows = list(todo), torch.tensor(list(todo.values()), dtype=torch.long)
-        fresh, rows = self._allowed(fresh, rows, schedules)
+        for row in missing.tolist():
+            todo.setdefault(keys[row], row)
+        fresh, rows = self._allowed(
+            list(todo), torch.tensor(list(todo.values()), dtype=torch.long), schedules
+        )
         if len(fresh) > self.sim.num_worlds:  # neighbours share most: let them be in one chunk
             order = in_order(schedules[rows].cpu().numpy(), self.trunk.modes[: len(self.trunk)])
             fresh, rows = [fresh[i] for i in order], rows[order]
@@ -103,24 +93,26 @@ class Evaluator:
             if rolled is None:
                 break
             self._learn(fresh[chunk], rolled)
-        return torch.tensor([self._answer(key, bound) for key in keys], dtype=torch.float64)
+        return torch.from_numpy(self._table.costs(self._table.find(keys), bound))
 
     @torch.no_grad()
     def follow(self, schedule: Schedule) -> float:
         """Cost of a schedule that is recorded, so that others are rolled out from where they part from it."""
         rows = schedule.tensor()[None]
-        key = self._keys(rows)[0]
-        known = self._known.get(key)
-        if known is None and not self._allowed([key], torch.tensor([0]), rows)[0]:
+        key = self._table.keys(rows)
+        found = self._table.find(key)
+        known = not bool(self._table.missing(found, math.inf)[0])
+        if not known and found[0] < 0 and not self._allowed(key, torch.tensor([0]), rows)[0]:
             return math.inf
-        if known is not None and known.terms is not None and not math.isfinite(known.cost):
+        if known and not math.isfinite(self._table.costs(found, math.inf)[0]):
             return math.inf
         self.trunk = record(self._worlds, self.trunk, schedule)
-        if known is None or known.terms is None:
+        if not known:
             self.rollouts += 1
             self.ruled_out += self.trunk.barred
             self.diverged += not (math.isfinite(self.trunk.cost) or self.trunk.barred)
-            self._known[key] = _Known(self.trunk.cost, self.trunk.terms.tolist())
+            terms = self.trunk.terms.cpu().numpy()
+            self._table.learn(key, np.array([self.trunk.cost]), np.array([False]), terms[None])
         return self.trunk.cost
 
     def cost(self, schedule: Schedule) -> float:
@@ -131,7 +123,8 @@ class Evaluator:
         """Cost of one schedule, term by term; NaN where its world diverged."""
         rows = schedule.tensor()[None]
         self.costs(rows)
-        return dict(zip(self.task.cost.names, self._known[self._keys(rows)[0]].terms or (), strict=True))
+        terms = self._table.terms(int(self._table.find(self._table.keys(rows))[0]))
+        return dict(zip(self.task.cost.names, terms.tolist(), strict=True))
 
     def trace(self, schedule: Schedule) -> Trace:
         """The trajectory of one schedule; its control steps are not counted."""
@@ -143,8 +136,9 @@ class Evaluator:
         if rules is None or not keys:
             return keys, rows
         broken = rules.broken(self.task.modes, schedules[rows], self.start.mode, self.start.ran)
-        for i in broken.nonzero().squeeze(1).tolist():
-            self._known[keys[i]] = _Known(math.inf, [math.nan] * len(self.task.cost.names))
+        out = [keys[i] for i in broken.nonzero().squeeze(1).tolist()]
+        nothing = np.full((len(out), len(self.task.cost.names)), math.nan)
+        self._table.learn(out, np.full(len(out), math.inf), np.zeros(len(out), dtype=bool), nothing)
         self.ruled_out += int(broken.sum())
         return [key for key, bad in zip(keys, broken.tolist(), strict=True) if not bad], rows[~broken]
 
@@ -153,16 +147,5 @@ class Evaluator:
         self.diverged += int(rolled.diverged.sum())
         self.pruned += int(rolled.pruned.sum())
         self.ruled_out += int(rolled.barred.sum())
-        rows = zip(rolled.cost.tolist(), rolled.terms.tolist(), rolled.pruned.tolist(), strict=True)
-        for key, (cost, terms, pruned) in zip(keys, rows, strict=True):
-            self._known[key] = _Known(cost, None if pruned else terms)
-
-    def _answer(self, key: bytes, bound: float) -> float:
-        known = self._known.get(key)
-        if known is None or not known.answers(bound):
-            return math.nan
-        return math.inf if known.terms is None else known.cost
-
-    def _keys(self, schedules: Tensor) -> list[bytes]:
-        small = torch.uint8 if len(self.task.modes) <= 256 else torch.int32
-        return [row.tobytes() for row in schedules.to("cpu", small).numpy()]
+        cost, pruned, terms = (part.cpu().numpy() for part in (rolled.cost, rolled.pruned, rolled.terms))
+        self._table.learn(keys, cost, pruned, terms)

@@ -38,8 +38,8 @@ SMALL = {
         {"train_steps_per_s", "collect_share", "physics_share", "learn_share"},
     ),
     "planner": (
-        Planner(threads=1, horizon=6, draws=40, samples=16, ticks=1),
-        {"plan_overhead_us", "candidates_per_s", "control_steps_fraction"},
+        Planner(threads=1, horizon=6, cartpole_horizon=10, samples=16, ticks=1, repeats=1),
+        {"us_per_candidate", "cartpole_exact_ms", "cartpole_converged_ms"},
     ),
 }
 
@@ -62,6 +62,7 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
             "task.jump.sampling.worlds=4",
         )
         args = Planner(**{**vars(args), "set": names + small})
+        expected = expected | {"shared_fraction", "pruned_fraction", "mppi_overhead"}
         expected = expected | {"go2_tick_ms_p50", "go2_tick_ms_p99", "go2_control_steps_fraction"}
 
     assert main(type(args)(**{**vars(args), "json": out})) == 0
@@ -88,8 +89,10 @@ def test_targets_are_printed_as_met_or_not() -> None:
     figures = Figures()
     figures.add("policy_efficiency", 0.81, "of which [us]")
     figures.add("open_loop_efficiency", 0.5, "")
+    figures.add("us_per_candidate", 1.9, "")
+    figures.add("shared_fraction", 0.31, "")
     cells = [[str(cell) for cell in column.cells] for column in figures.table("bench").columns]
-    assert ["not met" in text for text in cells[2]] == [False, True]
+    assert ["not met" in text for text in cells[2]] == [False, True, False, True]
     assert "us" in cells[3][0]
 
 

@@ -150,6 +150,12 @@ def disturbed_start(cfg: StartCfg, seed: int) -> tuple[Tensor, Tensor]:
     return x, x[7:19].clone()
 
 
+def search_options(cfg: SearchCfg) -> dict[str, Any]:
+    """Arguments of `Receding`."""
+    budget = Budget(draws=cfg.draws, control_steps=cfg.control_steps)
+    return {"samples": cfg.samples, "order": cfg.order, "pairs": cfg.pairs, "budget": budget}
+
+
 def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
     """One closed loop of planning and simulation."""
     world = task.make_sim(1)
@@ -159,10 +165,7 @@ def run(cfg: RunCfg, task: Task, seed: int, progress: Any = None) -> Run:
         task,
         seed=seed,
         schedule=["foot"] * task.horizon,
-        samples=cfg.search.samples,
-        order=cfg.search.order,
-        pairs=cfg.search.pairs,
-        budget=Budget(draws=cfg.search.draws, control_steps=cfg.search.control_steps),
+        **search_options(cfg.search),
     )
     steps = round(cfg.seconds / world.dt)
     xs, modes, log, terms = [world.x()[0]], [], [], []

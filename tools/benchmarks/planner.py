@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hmc import Budget, Receding, Task, plan
+from hmc import Receding, SwitchSpace, Task, plan
 from hmc.cfg import load
 from hmc.cost import Cost
-from hmc.go2.task import flip_task, policy_path
+from hmc.go2.model import load_model
+from hmc.go2.policy import Policy
+from hmc.go2.task import flip_task, jump_mode, make_sim, policy_path
 from hmc.modes import ModeSet
+from hmc.sim.mujoco import MujocoSim
 from hmc.tasks.cartpole import CartpoleCfg, ConstantInput, cartpole, initial_state
 from tools import flip
 from tools.benchmarks.figures import Common, Figures
@@ -28,58 +32,123 @@ class Planner(Common):
     """What the search itself costs, on a system that costs nothing, on the cartpole and on the Go2.
 
     Attributes:
-        horizon: of the systems that cost nothing, control steps.
-        draws: switches evaluated on the cartpole.
+        horizon: of the system that costs nothing and of the Go2's search of all of Omega, control steps.
+        cartpole_horizon: of the cartpole.
         samples: switches a batch.
+        repeats: of what is fast.
         ticks: of the Go2's closed loop, from shortly before the command to flip on.
         set: overrides of cfg/flip.toml.
     """
 
     horizon: int = 50
-    draws: int = 2048
+    cartpole_horizon: int = 100
     samples: int = 256
+    repeats: int = 5
     ticks: int = 20
     set: tuple[str, ...] = ()
 
 
 @torch.no_grad()
 def planner(args: Planner) -> Figures:
-    """Overhead a candidate, the share of naive control steps, and the Go2's planning time."""
+    """Overhead a candidate, exact and converged plans of the cartpole, and the Go2's planning."""
     figures = Figures()
     modes = ModeSet([ConstantInput(str(i), float(i)) for i in range(3)])
     zero = Cost({"nothing": lambda x, u, u_prev, k: x[:, 0]}, nonnegative=True)
     still = Task("still", modes, zero, args.horizon, NullSim)
-    sim = NullSim(args.samples)
-    found = [plan(still, [0.0], solver="exhaustive", samples=args.samples, sim=sim) for _ in range(3)]
+    sim = NullSim(len(SwitchSpace(3, args.horizon)))
+    size = sim.num_worlds
+    found = [plan(still, [0.0], solver="exhaustive", samples=size, sim=sim) for _ in range(args.repeats)]
     figures.add(
-        "plan_overhead_us",
+        "us_per_candidate",
         statistics.median(1e6 * p.elapsed / p.draws for p in found),
-        f"a candidate, modes and simulator that do nothing [us]; T {args.horizon}, M 3, all of Omega",
+        f"plan() with modes and simulator that do nothing [us]; T {args.horizon}, M 3, all of Omega",
     )
-
-    cfg = CartpoleCfg()
-    sim_cart = cartpole(cfg).make_sim(args.samples)
-    result = plan(
-        cartpole(cfg), initial_state(cfg), samples=args.samples, budget=Budget(draws=args.draws), sim=sim_cart
-    )
-    figures.add(
-        "candidates_per_s", result.draws / result.elapsed, f"cartpole, T {cfg.horizon}, M {cfg.num_modes}"
-    )
-    figures.add(
-        "control_steps_fraction",
-        result.control_steps / (cfg.horizon * result.draws),
-        "control steps used over T x schedules, cartpole",
-    )
+    _cartpole(figures, args)
 
     run = load(ROOT / "cfg" / "flip.toml", flip.RunCfg, args.set)
     if all(
         policy_path(*names).is_file()
         for names in (("footstand", run.task.foot), ("handstand", run.task.hand))
     ):
+        _omega(figures, args, run)
+        _replan(figures, args, run)
         _ticks(figures, args, run)
     else:
-        figures.notes["go2"] = "no policies: the Go2's planning time is left out"
+        figures.notes["go2"] = "no policies: the Go2's part is left out"
     return figures
+
+
+def _cartpole(figures: Figures, args: Planner) -> None:
+    """The single-switch problem solved exactly, and a plan that no single switch improves."""
+    cfg = CartpoleCfg(horizon=args.cartpole_horizon)
+    task, x, idle = cartpole(cfg), initial_state(cfg), [cfg.num_modes // 2] * cfg.horizon
+    what = f"cartpole, T {cfg.horizon}, M {cfg.num_modes}"
+    size = len(SwitchSpace(cfg.num_modes, cfg.horizon))
+    sim = task.make_sim(size)
+    exact = [
+        plan(task, x, schedule=idle, solver="exhaustive", samples=size, iterations=1, sim=sim)
+        for _ in range(args.repeats)
+    ]
+    figures.add(
+        "cartpole_exact_ms",
+        1e3 * statistics.median(p.elapsed for p in exact),
+        f"the best of all {size:,} switches [ms]; {what}",
+    )
+    sim = task.make_sim(args.samples)
+    converged = plan(task, x, schedule=idle, samples=args.samples, sim=sim)
+    figures.add(
+        "cartpole_converged_ms",
+        1e3 * converged.elapsed,
+        f"a locally optimal plan [ms], {len(converged.switches)} switches, {converged.draws:,} draws; {what}",
+    )
+
+
+def _omega(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
+    """All of Omega from a foot stand, policies as modes, without and with pruning."""
+    task = flip_task(cfg.task, threads=args.threads)
+    foot, hand = task.modes["foot"], task.modes["hand"]
+    modes = ModeSet([foot, hand, Policy(policy_path("handstand", cfg.task.hand), name="again")])
+    x, u = flip.disturbed_start(cfg.start, 0)
+    size = len(SwitchSpace(3, args.horizon))
+    for name, nonnegative, what in (
+        ("shared_fraction", False, "sharing beginnings"),
+        ("pruned_fraction", True, "sharing and pruning"),
+    ):
+        cost = replace(task.cost, nonnegative=nonnegative)
+        small = replace(task, modes=modes, cost=cost, horizon=args.horizon)
+        found = plan(small, x, u=u, schedule=["foot"] * args.horizon, solver="exhaustive", samples=size,
+                     iterations=1, sim=small.make_sim(min(size, 1024)))  # fmt: skip
+        figures.add(
+            name,
+            found.control_steps / (args.horizon * size),
+            f"control steps over T Z, {what}; Go2, T {args.horizon}, M 3, {found.elapsed:.1f} s",
+        )
+
+
+def _replan(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
+    """One MPPI update against the bare engine's rollouts of as many worlds and steps."""
+    settings = replace(cfg.task.jump.sampling, samples=30, horizon=40, replan_every=40, worlds=30)
+    sim = partial(make_sim, substeps=cfg.task.substeps, threads=args.threads)
+    mpc = jump_mode(replace(cfg.task.jump, sampling=settings), sim, seed=0)
+    x, u = (row[None] for row in flip.disturbed_start(cfg.start, 0))
+    bare = MujocoSim(load_model(), 30, substeps=cfg.task.substeps, threads=args.threads)
+    held = u.expand(30, -1)[:, None].expand(-1, 40 * cfg.task.substeps, -1).contiguous().numpy()
+    took: list[list[float]] = [[], []]
+    for i in range(3 * args.repeats):
+        k = torch.tensor([i])
+        memory = mpc.reset(x, u, k)
+        began = time.perf_counter()
+        mpc.act(x, u, memory, k)
+        took[0].append(time.perf_counter() - began)
+        bare.reset(x.expand(30, -1), u.expand(30, -1))
+        began = time.perf_counter()
+        bare.batch.rollout(held.shape[1], held, record=("qpos", "qvel"))
+        took[1].append(time.perf_counter() - began)
+    figures.add(
+        "mppi_overhead",
+        statistics.median(took[0]) / statistics.median(took[1]),
+        "an MPPI update of 30 rollouts of 40 control steps over Batch.rollout of as many",
+    )
 
 
 def _ticks(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
@@ -91,9 +160,7 @@ def _ticks(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
         task,
         schedule=["foot"] * task.horizon,
         k=max(0, cfg.task.command - 5),
-        samples=cfg.search.samples,
-        order=cfg.search.order,
-        budget=Budget(control_steps=cfg.search.control_steps),
+        **flip.search_options(cfg.search),
     )
     times, used, naive = [], 0, 0
     for _ in range(args.ticks):

@@ -1,0 +1,125 @@
+"""Figures and table of the cartpole study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from rich.table import Table
+
+from hmc.ilqr import Optimum
+from hmc.planner import Plan
+from tools.figures import save
+
+if TYPE_CHECKING:
+    from tools.cartpole import Row, StudyCfg
+
+NAMES = {"schedules": "mode schedules (ours)", "mppi": "MPPI", "cem": "CEM", "ps": "predictive sampling"}
+COLORS = {"schedules": "#d1495b", "mppi": "#30638e", "cem": "#edae49", "ps": "#4c9f70"}
+
+
+def reference(rows: list[Row], like: Row) -> float:
+    """The lowest of iLQR's local optima of a row's horizon and angle."""
+    same = [
+        r.cost for r in rows if r.planner == "ilqr" and (r.horizon, r.angle) == (like.horizon, like.angle)
+    ]
+    return min(same)
+
+
+def gap(rows: list[Row], row: Row) -> float:
+    """(J - J_iLQR) / T, the paper's measure."""
+    return (row.cost - reference(rows, row)) / row.horizon
+
+
+def pick(rows: list[Row], cfg: StudyCfg, part: str, planner: str) -> dict[int, list[Row]]:
+    """Rows of one planner by horizon, with the study's own number of modes and start angle."""
+    task = cfg.task
+    return {
+        horizon: [
+            row
+            for row in rows
+            if (row.part, row.planner, row.horizon) == (part, planner, horizon)
+            and (row.num_modes, row.angle) == (task.num_modes, task.angle)
+        ]
+        for horizon in sorted(cfg.horizons)
+    }
+
+
+def gaps(path: Path, rows: list[Row], cfg: StudyCfg) -> None:
+    """Optimality gap and receding-horizon cost over the horizon, mean and standard deviation over seeds."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), constrained_layout=True)
+    for planner in NAMES:
+        solved, run = (pick(rows, cfg, part, planner) for part in ("solve", "loop"))
+        _band(left, planner, {t: [gap(rows, row) for row in found] for t, found in solved.items()})
+        _band(right, planner, {t: [row.cost for row in found] for t, found in run.items()})
+    left.axhline(0, color="black", linewidth=0.8)
+    left.set_ylabel("(J - J of iLQR) / T")
+    left.set_title(f"one horizon, {cfg.rollouts} T control steps", fontsize=10)
+    right.set_ylabel("executed cost")
+    right.set_title(f"receding horizon, {cfg.loop.rollouts} T control steps a tick", fontsize=10)
+    for axis in (left, right):
+        axis.set_xlabel("horizon T [control steps]")
+    right.legend(fontsize=8)
+    save(figure, path)
+
+
+def _band(axis: Axes, planner: str, values: dict[int, list[float]]) -> None:
+    mean, std = (np.array([f(v) for v in values.values()]) for f in (np.mean, np.std))
+    axis.plot(list(values), mean, color=COLORS[planner], label=NAMES[planner], marker="o", markersize=3)
+    axis.fill_between(list(values), mean - std, mean + std, color=COLORS[planner], alpha=0.2, linewidth=0)
+
+
+def sequence(path: Path, found: Plan, best: Optimum, cfg: StudyCfg) -> None:
+    """A schedule's modes, and its input beside that of iLQR."""
+    time = np.arange(len(found.schedule)) * cfg.task.dt
+    levels = np.linspace(-1, 1, cfg.task.num_modes) * cfg.task.params.gear
+    figure, axes = plt.subplots(2, 1, sharex=True, figsize=(8, 4.2), constrained_layout=True)
+    axes[0].step(time, list(found.schedule), where="post", color=COLORS["schedules"])
+    axes[0].set_ylabel("mode")
+    axes[0].set_yticks(range(cfg.task.num_modes), [f"{level:+.0f} N" for level in levels])
+    axes[0].set_title(f"J = {found.cost:.2f}, iLQR {best.cost:.2f}", fontsize=10)
+    force = best.controls[:, 0].numpy() * cfg.task.params.gear
+    axes[1].plot(time, force, color=COLORS["mppi"], label="iLQR")
+    axes[1].step(
+        time, levels[list(found.schedule)], where="post", color=COLORS["schedules"], label="schedule"
+    )
+    axes[1].set_ylabel("force [N]")
+    axes[1].set_xlabel("time [s]")
+    axes[1].legend(fontsize=8)
+    save(figure, path)
+
+
+def table(rows: list[Row], cfg: StudyCfg) -> Table:
+    """Mean and standard deviation over seeds: gap, receding-horizon cost, and what they depend on."""
+    view = Table(title="the cartpole")
+    for name in ("", *NAMES.values()):
+        view.add_column(name, justify="right")
+
+    def line(label: str, cells: list[list[float]]) -> None:
+        view.add_row(label, *(f"{np.mean(c):.3f} ± {np.std(c):.3f}" if c else "" for c in cells))
+
+    for part, label in (("solve", "gap"), ("loop", "run")):
+        for horizon in sorted(cfg.horizons):
+            found = [pick(rows, cfg, part, planner)[horizon] for planner in NAMES]
+            values = [[gap(rows, r) if part == "solve" else r.cost for r in each] for each in found]
+            line(f"{label}, T = {horizon}", values)
+    solved = [row for row in rows if row.part == "solve" and row.horizon == cfg.task.horizon]
+    for count in cfg.num_modes:
+        ours = [
+            r for r in solved if (r.planner, r.num_modes, r.angle) == ("schedules", count, cfg.task.angle)
+        ]
+        line(f"gap, {count} modes", [[gap(rows, row) for row in ours]])
+    for angle in cfg.angles:
+        cells = [
+            [
+                gap(rows, r)
+                for r in solved
+                if (r.planner, r.angle, r.num_modes) == (planner, angle, cfg.task.num_modes)
+            ]
+            for planner in NAMES
+        ]
+        line(f"gap from {np.degrees(angle):.0f} deg", cells)
+    return view
