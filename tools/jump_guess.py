@@ -19,6 +19,7 @@ from rich.console import Console  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 from hmc.cfg import load  # noqa: E402
+from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2 import model as go2  # noqa: E402
 from hmc.go2.stances import FOOTSTAND, HANDSTAND  # noqa: E402
 from hmc.go2.task import dense_guess, flip_task, make_sim  # noqa: E402
@@ -79,7 +80,9 @@ def settled_stands(task: Task, cfg: RunCfg, n: int, seed: int, threads: int) -> 
         sim.step(action)
     good = FOOTSTAND.held(x).nonzero().squeeze(1)
     if len(good) == 0:
-        raise RuntimeError("the foot mode holds none of the starting stands: train it first")
+        raise ValueError(
+            "the foot mode holds none of the starting stands: give a trained policy, task.foot=FILE"
+        )
     pick = good[torch.randint(len(good), (n,))]
     return x[pick], u[pick]
 
@@ -129,8 +132,9 @@ def badness(x: Tensor, touched: Tensor) -> Tensor:
 def main(args: Args) -> None:
     """Search, show progress, write the best mean."""
     torch.manual_seed(args.seed)
-    cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
-    task = flip_task(cfg.task, threads=args.threads)
+    with one_line_errors():
+        cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
+        task = flip_task(cfg.task, threads=args.threads)
     worlds = args.candidates * args.starts * len(args.durations)
     sim = make_sim(worlds, threads=args.threads)
     first = torch.tensor([[0.82, -1.6, 2.12, -1.16]], dtype=torch.float64)
@@ -142,9 +146,9 @@ def main(args: Args) -> None:
     each = args.starts * len(args.durations)
     console = Console()
     for iteration in range(args.iterations):
-        x, u = settled_stands(
-            task, cfg, args.starts, 1000 * args.seed + iteration * args.starts, args.threads
-        )
+        with one_line_errors():
+            seed = 1000 * args.seed + iteration * args.starts
+            x, u = settled_stands(task, cfg, args.starts, seed, args.threads)
         points = mean + spread * torch.randn(args.candidates, *mean.shape, dtype=torch.float64)
         points[0] = mean
         inputs = torch.stack([dense_guess(p, cfg.task.jump.spacing) for p in points])

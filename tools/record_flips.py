@@ -20,6 +20,7 @@ import tyro  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from hmc.cfg import load  # noqa: E402
+from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, make_sim  # noqa: E402
 from tools.flip import RunCfg  # noqa: E402
 from tools.jump_guess import settled_stands  # noqa: E402
@@ -53,10 +54,11 @@ class Args:
 def main(args: Args) -> None:
     """Jump, keep, write."""
     torch.manual_seed(args.seed)
-    cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
-    task = flip_task(cfg.task, seed=args.seed, threads=args.threads)
+    with one_line_errors():
+        cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
+        task = flip_task(cfg.task, seed=args.seed, threads=args.threads)
+        x, u = settled_stands(task, cfg, args.states, 1_000_000 * (args.seed + 1), args.threads)
     jump = task.modes["jump"]
-    x, u = settled_stands(task, cfg, args.states, 1_000_000 * (args.seed + 1), args.threads)
     sim = make_sim(args.states, threads=args.threads)
     sim.reset(x, u)
     after = torch.randint(args.first, args.last + 1, (args.states,))
