@@ -40,7 +40,7 @@ class Evaluator:
         trunk: what was recorded last.
         rollouts: schedules rolled out so far.
         diverged: schedules among them whose world stopped being finite.
-        pruned: schedules among them given up because their partial cost exceeded the bound.
+        pruned: schedules among them given up because they were sure to exceed the bound.
         ruled_out: schedules that the task's rules do not allow; their cost is inf.
     """
 

@@ -20,10 +20,10 @@ class Rolled:
     """What came of n rollouts.
 
     Attributes:
-        cost: J, (n,) float64; inf where diverged, the partial cost where pruned.
+        cost: J, (n,) float64; inf where diverged, a lower bound where pruned.
         terms: each term's share, (n, number of terms) float64; NaN where diverged or pruned.
         diverged: worlds whose state, input or cost stopped being finite, (n,) bool.
-        pruned: worlds given up because their partial cost exceeded the bound, (n,) bool.
+        pruned: worlds given up because they are sure to exceed the bound, (n,) bool.
         barred: worlds that came to a mode whose guard barred it, (n,) bool; their cost is inf.
     """
 
@@ -51,7 +51,8 @@ def roll(
         worlds: where to; the first n are used.
         trunk: where from, and what is known already.
         schedules: mode indices, long.
-        bound: where cost terms are non-negative, a world is given up once its partial cost exceeds this.
+        bound: where cost terms are non-negative, a world is given up once its partial cost, with the task's
+            lower bound of the rest, exceeds this.
         stop: asked before every control step; when it says True the rollout ends with None.
     """
     sim, cost = worlds.sim, worlds.task.cost
@@ -59,6 +60,8 @@ def roll(
     tree = branches(schedules.cpu(), trunk.modes[: len(trunk)])
     modes, parents = tree.modes.to(sim.device), tree.parent.to(sim.device)
     limit = bound if cost.nonnegative else math.inf
+    rest = worlds.task.lower_bound if math.isfinite(limit) else None
+    slack = 1e-9 * abs(limit)  # more than rounding can make of partial cost and lower bound
     stages, guarded = len(cost.stage), worlds.task.rules is not None and bool(worlds.task.rules.guards)
     result = torch.full((n,), math.inf, dtype=torch.float64, device=sim.device)
     terms = torch.zeros(n, len(cost.names), dtype=torch.float64, device=sim.device)
@@ -100,6 +103,13 @@ def roll(
             ids, x, k = ids[~bad], x[~bad], k[~bad]
             if len(ids) == 0:
                 continue
+        if rest is not None:
+            least = total(terms[ids]) + rest(x, k, horizon - i).to(torch.float64) - slack
+            if bool((bad := least > limit).any()):
+                result[ids[bad]], pruned[ids[bad]], going[ids[bad]] = least[bad], True, False
+                ids, x, k = ids[~bad], x[~bad], k[~bad]
+                if len(ids) == 0:
+                    continue
         u_prev = sim.u(_indexed(sim, ids))
         u = worlds.act(ids, modes[ids, i], x, u_prev, k)
         terms[ids, :stages] += stage_terms(worlds.task, x, u, u_prev, k, sim.dt)

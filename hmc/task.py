@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from hmc.cost import Cost
 from hmc.modes import ModeSet
 from hmc.rules import Rules
@@ -22,6 +24,9 @@ class Task:
         horizon: length T of a schedule in control steps.
         make_sim: number of worlds -> a simulator to plan in.
         rules: what schedules have to respect; None for nothing.
+        lower_bound: f(x, k, steps) -> (n,), at most what any schedule costs from states x (n, nx) at control
+            steps k (n,) over the `steps` that are left, terminal cost included: rollouts that cannot get
+            below the best known cost end sooner. Used where the cost says that it is non-negative.
     """
 
     name: str
@@ -30,6 +35,7 @@ class Task:
     horizon: int
     make_sim: Callable[[int], Sim]
     rules: Rules | None = None
+    lower_bound: Callable[[Tensor, Tensor, int], Tensor] | None = None
 
     def __post_init__(self) -> None:
         if self.horizon <= 0:

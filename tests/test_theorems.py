@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -154,3 +155,35 @@ def test_a_pair_gets_past_what_no_single_switch_improves():
     assert len(freed.switches) == 2
     assert freed.costs == (stuck.cost, freed.cost)
     assert freed.cost == min(brute_force(task, x).values()) < stuck.cost
+
+
+@given(
+    system=st.tuples(st.integers(0, 9999), st.integers(1, 5)),
+    solver=st.sampled_from(["sample", "exhaustive"]),
+    samples=st.integers(2, 40),
+)
+@settings(max_examples=200)
+def test_pruning_never_changes_a_plan(system, solver, samples):
+    """Without pruning, with it, and with a lower bound: what the next step's state is sure to cost."""
+    task, x, incumbent = random_task(*system)
+    stage = {name: lambda *args, f=f: 1.0 + f(*args) for name, f in task.cost.stage.items()}
+    bowl = stage["bowl"]
+
+    def ahead(x, k, steps):
+        return 0.5 * bowl(x, None, None, k) if steps > 0 else torch.zeros(len(x))
+
+    plain = replace(task, cost=Cost(stage, task.cost.terminal))
+    pruned = replace(task, cost=Cost(stage, task.cost.terminal, nonnegative=True))
+    options = {"schedule": incumbent, "solver": solver, "samples": samples, "iterations": 2}
+    first, second, third = (
+        plan(each, x, **options) for each in (plain, pruned, replace(pruned, lower_bound=ahead))
+    )
+    for other in (second, third):
+        assert other.schedule == first.schedule
+        assert other.costs == first.costs
+        assert (other.switches, other.seen, other.stopped_by) == (
+            first.switches,
+            first.seen,
+            first.stopped_by,
+        )
+    assert third.control_steps <= second.control_steps <= first.control_steps
