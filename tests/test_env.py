@@ -12,6 +12,8 @@ from hmc.go2 import model as go2
 from hmc.go2.observe import OBS_SIZE, observe, pitch
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STANCES
 from tests.tiny import CFG, make_env
+from tools.random_policy import write_random_policy
+from train import evaluate
 from train.env import NoiseCfg
 from train.starts import HOME, KINDS, RECORDED, STANCE, WAY, Starts, StartsCfg
 
@@ -227,6 +229,17 @@ def test_recorded_starts(tmp_path):
     pairs = torch.cat([x, u], 1)
     for row in torch.cat([start.x, start.u], 1)[mine]:
         assert (row == pairs).all(1).any(), "a state with its own input"
+
+
+def test_a_measurement_takes_each_recorded_state_once(tmp_path):
+    policy = write_random_policy(tmp_path / "random.onnx", hidden=(8,))
+    x = torch.randn(5, 37)
+    torch.save({"x": x, "u": torch.randn(5, 12)}, tmp_path / "flips.pt")
+    args = evaluate.Args(policy, starts="recorded", records=tmp_path / "flips.pt", episodes=5)
+    starts = evaluate.set_up(args)[1]
+    torch.testing.assert_close(starts.sample(5).x.float(), x)
+    with pytest.raises(ValueError, match=r"flips\.pt has 5 states, too few for 6 episodes"):
+        evaluate.set_up(replace(args, episodes=6))
 
 
 def test_recorded_starts_need_their_file(tmp_path):

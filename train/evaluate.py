@@ -96,7 +96,7 @@ class Args:
             reached within 3 s and held 5 s; recorded: states of --records, likewise.
         episodes: number of episodes.
         seed: of the starts.
-        records: file of recorded states, as tools/record_flips.py writes it.
+        records: file of recorded states, as tools/record_flips.py writes it, one an episode.
         threads: of the engine; 0 for all cores.
         json: also write the result here.
     """
@@ -115,7 +115,13 @@ def set_up(args: Args) -> tuple[Policy, Starts]:
     policy = Policy(args.policy)
     shares = {"stance": 0.0, "way": 0.0, "home": 0.0, "recorded": 0.0, args.starts: 1.0}
     cfg = StartsCfg(**shares, records=str(args.records.resolve()) if args.records else "")
-    return policy, Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
+    starts = Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
+    if args.starts == "recorded" and starts.records is not None and len(starts.records["x"]) < args.episodes:
+        raise ValueError(
+            f"{args.records} has {len(starts.records['x'])} states, too few for {args.episodes} episodes of "
+            "one each: record more, or ask for fewer --episodes"
+        )
+    return policy, starts
 
 
 def main(args: Args) -> None:

@@ -70,7 +70,7 @@ class Starts:
         stance: what the policy is to hold.
         cfg: shares and disturbances.
         device: where the tensors live.
-        unlocked: draw all kinds from the beginning, as to measure a policy.
+        unlocked: to measure a policy: draw all kinds from the beginning, and each recorded state once.
     """
 
     WIDTH, ENERGIES = 0.1, 7  # of a place; number of energies
@@ -113,7 +113,10 @@ class Starts:
         )
         if self.records is not None:
             recorded = (kind == RECORDED).nonzero().squeeze(1)
-            pick = torch.randint(len(self.records["x"]), (len(recorded),), device=self.device)
+            many = len(self.records["x"])
+            pick = torch.randint(many, (len(recorded),), device=self.device)
+            if self.unlocked and len(recorded) <= many:
+                pick = torch.arange(len(recorded), device=self.device)
             x[recorded] = self.records["x"][pick].to(x)
             u[recorded] = self.records["u"][pick].to(u)
         return Start(x, u, kind, cell)
