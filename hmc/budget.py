@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from hmc.evaluate import Evaluator
+from hmc.ensemble import AnyEvaluator
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Meter:
     """A budget being spent by one search with one evaluator; time runs from its making."""
 
     budget: Budget
-    evaluator: Evaluator
+    evaluator: AnyEvaluator
     draws: int = 0
     began: float = field(default_factory=lambda: time.perf_counter())
 

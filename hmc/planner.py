@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from hmc.budget import Budget, Meter
-from hmc.evaluate import Evaluator
+from hmc.ensemble import make_evaluator
 from hmc.schedule import Schedule, Switch, SwitchSpace
 from hmc.sim.base import Sim
 from hmc.solvers import ORDERS, SOLVERS, Search, run
@@ -197,7 +197,7 @@ def plan(
         u, mode, memory, k, snapshot = x.u, x.mode, x.memory if x.mode is not None else None, x.k, x.snapshot
         ran, x = x.ran, x.x
     start = make_start(task, sim, x, u, mode, memory, k, snapshot, ran)
-    meter = Meter(budget or Budget(), Evaluator(task, sim, start, known))
+    meter = Meter(budget or Budget(), make_evaluator(task, sim, start, known))
     incumbent = _incumbent(task, start, mode, schedule)
     if start.mode is not None and not math.isfinite(meter.evaluator.follow(incumbent)):
         stay = Schedule.constant(start.mode, task.horizon, task.modes.names)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hmc.budget import Meter
-from hmc.evaluate import Evaluator
+from hmc.ensemble import AnyEvaluator
 from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst, tails
 
 
@@ -35,7 +35,7 @@ class Search:
         stopped_by: why the search ended; None while it runs.
     """
 
-    evaluator: Evaluator
+    evaluator: AnyEvaluator
     meter: Meter
     schedule: Schedule
     samples: int

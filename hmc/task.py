@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -11,6 +12,9 @@ from hmc.cost import Cost
 from hmc.modes import ModeSet
 from hmc.rules import Rules
 from hmc.sim.base import Sim
+
+if TYPE_CHECKING:
+    from hmc.ensemble import Ensemble
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,7 @@ class Task:
         lower_bound: f(x, k, steps) -> (n,), at most what any schedule costs from states x (n, nx) at control
             steps k (n,) over the `steps` that are left, terminal cost included: rollouts that cannot get
             below the best known cost end sooner. Used where the cost says that it is non-negative.
+        ensemble: models that schedules are judged on in place of one from `make_sim`; None for that one.
     """
 
     name: str
@@ -36,6 +41,7 @@ class Task:
     make_sim: Callable[[int], Sim]
     rules: Rules | None = None
     lower_bound: Callable[[Tensor, Tensor, int], Tensor] | None = None
+    ensemble: Ensemble | None = None
 
     def __post_init__(self) -> None:
         if self.horizon <= 0:
