@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hmc.cost import Cost, StageFn
 from hmc.go2 import model as go2
+from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.modes import ModeSet
@@ -80,6 +81,7 @@ class FlipCfg:
         foot: policy file of the foot stand; empty for the one that comes with the package.
         hand: policy file of the handstand, likewise.
         substeps: physics steps a control step.
+        ensemble: other models that schedules are judged on as well.
     """
 
     horizon: int = 75
@@ -89,6 +91,7 @@ class FlipCfg:
     foot: str = ""
     hand: str = ""
     substeps: int = 4
+    ensemble: EnsembleCfg = field(default_factory=EnsembleCfg)
 
 
 def timeline(command: int) -> Callable[[Tensor], Tensor]:
@@ -192,7 +195,7 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
 
     Args:
         cfg: settings.
-        seed: of the jump's noise.
+        seed: of the jump's noise and of the ensemble.
         threads: of the engine and the policies; 0 for all cores.
     """
     sim = partial(make_sim, substeps=cfg.substeps, threads=threads)
@@ -203,4 +206,6 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
             Policy(policy_path("handstand", cfg.hand), name="hand", threads=threads),
         ]
     )
-    return Task("flip", modes, stance_cost(cfg.cost, timeline(cfg.command)), cfg.horizon, sim)
+    cost = stance_cost(cfg.cost, timeline(cfg.command))
+    others = make_ensemble(cfg.ensemble, seed=seed, substeps=cfg.substeps, threads=threads)
+    return Task("flip", modes, cost, cfg.horizon, sim, ensemble=others)

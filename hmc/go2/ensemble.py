@@ -1,0 +1,88 @@
+"""Other Go2s that the robot might be: models and starts for robust planning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import mujoco
+import torch
+from torch import Tensor
+
+from hmc.ensemble import Ensemble, Member
+from hmc.go2.model import load_model
+from hmc.sim.mujoco import MujocoSim
+
+
+@dataclass(frozen=True)
+class EnsembleCfg:
+    """How the planner's models differ from the nominal one, each value uniform in its range.
+
+    Attributes:
+        members: models beside the nominal one; 0 plans on that alone.
+        tail: share of the worst members that counts, see `hmc.Ensemble`.
+        friction: of the feet, lowest and highest.
+        payload: added to the trunk, least and most [kg].
+        com: half width of the shift of the trunk's centre of mass along each axis [m].
+        joints: half width of an error of the estimated joint positions [rad].
+        velocity: half width of an error of the estimated base velocity [m/s].
+    """
+
+    members: int = 0
+    tail: float = 1.0
+    friction: tuple[float, float] = (0.6, 1.0)
+    payload: tuple[float, float] = (-0.5, 1.0)
+    com: float = 0.02
+    joints: float = 0.01
+    velocity: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.members < 0:
+            raise ValueError(f"ensemble.members must be >= 0, got {self.members}")
+        for name in ("friction", "payload"):
+            low, high = getattr(self, name)
+            if not low <= high:
+                raise ValueError(f"ensemble.{name} must be (lowest, highest), got {low}, {high}")
+
+
+def perturbed_model(
+    friction: float = 0.8, payload: float = 0.0, com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> mujoco.MjModel:
+    """The Go2 with another foot friction, a payload in the trunk [kg], and its centre of mass shifted [m]."""
+    model = load_model()
+    feet = [i for i in range(model.ngeom) if model.geom_priority[i] == 1]
+    model.geom_friction[feet, 0] = friction
+    base = model.body("base").id
+    heavier = 1.0 + payload / model.body_mass[base]
+    model.body_mass[base] *= heavier
+    model.body_inertia[base] *= heavier
+    model.body_ipos[base] += com
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def make_ensemble(cfg: EnsembleCfg, *, seed: int = 0, substeps: int = 4, threads: int = 0) -> Ensemble | None:
+    """The nominal Go2 and `cfg.members` others; None where there are none."""
+    if cfg.members == 0:
+        return None
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, n: int = 1) -> Tensor:
+        return low + (high - low) * torch.rand(n, generator=generator, dtype=torch.float64)
+
+    found = [Member(partial(MujocoSim, load_model(), substeps=substeps, threads=threads))]
+    for _ in range(cfg.members):
+        shift = uniform(-cfg.com, cfg.com, 3).tolist()
+        model = perturbed_model(float(uniform(*cfg.friction)), float(uniform(*cfg.payload)), tuple(shift))
+        error = torch.zeros(37, dtype=torch.float64)
+        error[7:19], error[19:22] = (
+            uniform(-cfg.joints, cfg.joints, 12),
+            uniform(-cfg.velocity, cfg.velocity, 3),
+        )
+        make_sim = partial(MujocoSim, model, substeps=substeps, threads=threads)
+        found.append(Member(make_sim, partial(_beside, error=error)))
+    return Ensemble(found, cfg.tail)
+
+
+def _beside(x: Tensor, u: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
+    return x + error.to(x), u

@@ -1,0 +1,87 @@
+"""Other Go2s: their mass, balance and friction, and a flip planned on several."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from hmc import Budget, plan
+from hmc.go2.ensemble import EnsembleCfg, make_ensemble, perturbed_model
+from hmc.go2.model import load_model
+from hmc.go2.stances import FOOTSTAND
+from hmc.go2.task import FlipCfg, flip_task
+from tools.random_policy import write_random_policy
+
+
+def centre_of_mass(model) -> np.ndarray:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data.subtree_com[0].copy()
+
+
+def test_mass_and_centre_of_mass():
+    nominal, other = load_model(), perturbed_model(payload=1.5, com=(0.02, -0.01, 0.03))
+    total = nominal.body_mass.sum()
+    assert other.body_mass.sum() == pytest.approx(total + 1.5)
+    assert other.body_subtreemass[1] == pytest.approx(total + 1.5), "derived figures follow"
+    trunk = nominal.body("base")
+    moment = total * centre_of_mass(nominal) + 1.5 * (trunk.ipos + np.array([0.02, -0.01, 0.475]))
+    moment += trunk.mass[0] * np.array([0.02, -0.01, 0.03])
+    np.testing.assert_allclose(centre_of_mass(other), moment / (total + 1.5), atol=1e-12)
+    same = perturbed_model()
+    np.testing.assert_array_equal(same.body_mass, nominal.body_mass)
+    np.testing.assert_array_equal(same.geom_friction, nominal.geom_friction)
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.9])
+def test_friction_of_the_feet_on_the_floor(friction):
+    model = perturbed_model(friction=friction)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 0.28
+    data.qpos[7:] = np.tile([0.0, 0.9, -1.8], 4)
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 4
+    assert {contact.friction[0] for contact in data.contact} == {friction}
+
+
+def test_members_differ_and_are_the_same_for_a_seed():
+    cfg = EnsembleCfg(members=3)
+    ensembles = [make_ensemble(cfg, seed=seed, threads=1) for seed in (4, 4, 5)]
+    x, u = FOOTSTAND.state(), torch.zeros(12, dtype=torch.float64)
+    ends: list[list[torch.Tensor]] = []
+    for ensemble in ensembles:
+        assert ensemble is not None
+        assert len(ensemble.members) == 4
+        ends.append([])
+        for member in ensemble.members:
+            sim = member.make_sim(1)
+            begin = (x, u) if member.disturb is None else member.disturb(x, u)
+            sim.reset(begin[0][None], begin[1][None])
+            for _ in range(5):
+                sim.step(x[None, 7:19])
+            ends[-1].append(sim.x()[0])
+    for a, b, c in zip(*ends, strict=True):
+        assert torch.equal(a, b)
+        assert torch.equal(a, c) == (a is ends[0][0]), "only the nominal model is alike for all seeds"
+    assert len({tuple(end.tolist()) for end in ends[0]}) == 4
+    assert make_ensemble(EnsembleCfg()) is None
+
+
+def test_a_flip_is_planned_on_all_members(tmp_path):
+    policy = str(write_random_policy(tmp_path / "random.onnx", hidden=(8,)))
+    cfg = FlipCfg(horizon=4, command=2, foot=policy, hand=policy, ensemble=EnsembleCfg(members=2))
+    task = flip_task(cfg, threads=1)
+    x = FOOTSTAND.state()
+    found = plan(task, x, u=x[7:19], samples=4, budget=Budget(draws=4))
+    assert found.rollouts % 3 == 0
+    assert found.rollouts >= 3
+    assert found.cost <= found.incumbent_cost
+
+
+def test_bad_values():
+    with pytest.raises(ValueError, match=r"ensemble\.members must be >= 0, got -1"):
+        EnsembleCfg(members=-1)
+    with pytest.raises(ValueError, match=r"ensemble\.friction must be \(lowest, highest\), got 1\.0, 0\.5"):
+        EnsembleCfg(friction=(1.0, 0.5))
