@@ -30,6 +30,7 @@ class Plan:
         schedule: the best schedule found.
         terms: its cost, term by term.
         incumbent: the schedule that the search began with.
+        incumbent_terms: its cost, term by term.
         switches: accepted switches, in order; stitched onto `incumbent` they give `schedule`.
         costs: the incumbent's cost, then the cost after each accepted switch, or pair of switches (never
             rising, Theorem 1).
@@ -52,6 +53,7 @@ class Plan:
     schedule: Schedule
     terms: Mapping[str, float]
     incumbent: Schedule
+    incumbent_terms: Mapping[str, float]
     switches: tuple[Switch, ...]
     costs: tuple[float, ...]
     seen: int
@@ -75,6 +77,12 @@ class Plan:
     def incumbent_cost(self) -> float:
         """J of `incumbent`."""
         return self.costs[0]
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """Why these switches: how much each term of the cost changed, the largest fall first."""
+        change = {name: value - self.incumbent_terms[name] for name, value in self.terms.items()}
+        return dict(sorted(change.items(), key=lambda item: item[1]))
 
     @property
     def coverage(self) -> float:
@@ -106,6 +114,8 @@ class Plan:
             + (f", {self.ruled_out} schedules against the rules" if self.ruled_out else "")
             + (f"; stopped by {self.stopped_by}" if self.stopped_by else ""),
         ]
+        if self.switches:
+            lines.append("by term: " + ", ".join(f"{name} {gain:+.4g}" for name, gain in self.gains.items()))
         if self.machine_dependent:
             lines.append(f"{self.stopped_by} is not a count: a run at another speed may find another plan")
         return "\n".join(lines)
@@ -241,6 +251,7 @@ def _plan(search: Search, incumbent: Schedule) -> Plan:
         schedule=schedule,
         terms=evaluator.terms(search.schedule),
         incumbent=incumbent,
+        incumbent_terms=evaluator.terms(incumbent),
         switches=tuple(search.switches),
         costs=tuple(search.costs),
         seen=search.seen,

@@ -39,6 +39,9 @@ def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, or
     assert result.cost == slow_cost(task, result.schedule, x)
     assert sum(result.terms.values()) == pytest.approx(result.cost, rel=1e-12)
     assert tuple(result.terms) == task.cost.names
+    assert sum(result.incumbent_terms.values()) == pytest.approx(result.incumbent_cost, rel=1e-12)
+    assert sum(result.gains.values()) == pytest.approx(result.cost - result.incumbent_cost, abs=1e-9)
+    assert list(result.gains.values()) == sorted(result.gains.values())
     stitched = result.incumbent
     for switch in result.switches:
         stitched = stitched.stitch(switch)
