@@ -308,3 +308,16 @@ def test_frontier():
     assert starts.frontier() == pytest.approx(1.0 - 5 * starts.WIDTH)
     starts.success[-1, 0] = 0.9
     assert starts.frontier() == pytest.approx(-1.0)
+
+
+def test_starts_drawn_in_advance_come_once_and_in_order():
+    env = make_env()
+    env._ahead = None
+    torch.manual_seed(3)
+    parts = [env._draw(n) for n in (1, 5, 100, 150, 3)]
+    torch.manual_seed(3)
+    whole = env.starts.sample(env.AHEAD)
+    torch.testing.assert_close(torch.cat([part.x for part in parts[:4]]), whole.x)
+    assert torch.equal(torch.cat([part.kind for part in parts[:4]]), whole.kind)
+    assert len(parts[4].x) == 3
+    assert len(env._draw(1000).x) == 1000
