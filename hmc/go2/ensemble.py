@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hmc.ensemble import Ensemble, Member
-from hmc.go2.model import load_model
+from hmc.go2.model import SUBSTEPS, load_model
 from hmc.sim.mujoco import MujocoSim
 
 
@@ -46,10 +46,15 @@ class EnsembleCfg:
 
 
 def perturbed_model(
-    friction: float = 0.8, payload: float = 0.0, com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    friction: float = 0.8,
+    payload: float = 0.0,
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    substeps: int = SUBSTEPS,
+    iterations: int | None = None,
 ) -> mujoco.MjModel:
     """The Go2 with another foot friction, a payload in the trunk [kg], and its centre of mass shifted [m]."""
-    model = load_model()
+    model = load_model(substeps, iterations)
     feet = [i for i in range(model.ngeom) if model.geom_priority[i] == 1]
     model.geom_friction[feet, 0] = friction
     base = model.body("base").id
@@ -61,7 +66,14 @@ def perturbed_model(
     return model
 
 
-def make_ensemble(cfg: EnsembleCfg, *, seed: int = 0, substeps: int = 4, threads: int = 0) -> Ensemble | None:
+def make_ensemble(
+    cfg: EnsembleCfg,
+    *,
+    seed: int = 0,
+    substeps: int = SUBSTEPS,
+    iterations: int | None = None,
+    threads: int = 0,
+) -> Ensemble | None:
     """The nominal Go2 and `cfg.members` others; None where there are none."""
     if cfg.members == 0:
         return None
@@ -70,10 +82,16 @@ def make_ensemble(cfg: EnsembleCfg, *, seed: int = 0, substeps: int = 4, threads
     def uniform(low: float, high: float, n: int = 1) -> Tensor:
         return low + (high - low) * torch.rand(n, generator=generator, dtype=torch.float64)
 
-    found = [Member(partial(MujocoSim, load_model(), substeps=substeps, threads=threads))]
+    found = [Member(partial(MujocoSim, load_model(substeps, iterations), substeps=substeps, threads=threads))]
     for _ in range(cfg.members):
         shift = uniform(-cfg.com, cfg.com, 3).tolist()
-        model = perturbed_model(float(uniform(*cfg.friction)), float(uniform(*cfg.payload)), tuple(shift))
+        model = perturbed_model(
+            float(uniform(*cfg.friction)),
+            float(uniform(*cfg.payload)),
+            tuple(shift),
+            substeps=substeps,
+            iterations=iterations,
+        )
         error = torch.zeros(37, dtype=torch.float64)
         error[7:19], error[19:22] = (
             uniform(-cfg.joints, cfg.joints, 12),

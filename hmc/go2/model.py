@@ -44,9 +44,22 @@ HIP_CENTRE = 0.08  # of the hip's sphere, sideways from its joint
 CALF_END = (0.01, 0.17)  # where the shin's capsule ends: forward and down from the knee
 
 
-def load_model() -> mujoco.MjModel:
-    """The compiled model (nq 19, nv 18, nu 12), 5 ms a physics step."""
-    return mujoco.MjModel.from_xml_path(str(resources.files("hmc.go2") / "go2.xml"))
+DT = 0.02  # s, the control step that policies are trained at
+SUBSTEPS = 4  # physics steps a control step
+
+
+def load_model(substeps: int = SUBSTEPS, iterations: int | None = None) -> mujoco.MjModel:
+    """The compiled model (nq 19, nv 18, nu 12), with so many physics steps a control step of 20 ms.
+
+    Args:
+        substeps: physics steps a control step; fewer make a coarser model.
+        iterations: of the contact solver, at most; None for the model file's.
+    """
+    model = mujoco.MjModel.from_xml_path(str(resources.files("hmc.go2") / "go2.xml"))
+    model.opt.timestep = DT / substeps
+    if iterations is not None:
+        model.opt.iterations = iterations
+    return model
 
 
 def motor_torque(q: Tensor, qd: Tensor, target: Tensor) -> Tensor:

@@ -15,8 +15,6 @@ from hmc.go2 import model as go2
 from hmc.go2.observe import OBS_SIZE, OBS_VERSION, anchor_of, observe
 from hmc.modes import Mode
 
-DT = 0.02  # s, the control step that policies are trained at
-
 
 def contract() -> dict[str, Any]:
     """What a policy file must agree with, field by field."""
@@ -26,7 +24,7 @@ def contract() -> dict[str, Any]:
         "joint_order": list(go2.JOINTS),
         "kp": go2.KP,
         "kd": go2.KD,
-        "control_dt": DT,
+        "control_dt": go2.DT,
     }
 
 

@@ -80,7 +80,8 @@ class FlipCfg:
         jump: the jump mode.
         foot: policy file of the foot stand; empty for the one that comes with the package.
         hand: policy file of the handstand, likewise.
-        substeps: physics steps a control step.
+        substeps: physics steps a control step of the planner's model; the robot's own has 4.
+        iterations: of the contact solver in the planner's model, at most.
         ensemble: other models that schedules are judged on as well.
     """
 
@@ -90,7 +91,8 @@ class FlipCfg:
     jump: JumpCfg = field(default_factory=JumpCfg)
     foot: str = ""
     hand: str = ""
-    substeps: int = 4
+    substeps: int = go2.SUBSTEPS
+    iterations: int = 20
     ensemble: EnsembleCfg = field(default_factory=EnsembleCfg)
 
 
@@ -185,9 +187,12 @@ def dense_guess(points: Tensor, spacing: int) -> Tensor:
     return torch.cat([hip, front, hip, front, hip, rear, hip, rear], 1)
 
 
-def make_sim(num_worlds: int, substeps: int = 4, threads: int = 0) -> Sim:
-    """Worlds of the Go2 on the C engine."""
-    return MujocoSim(go2.load_model(), num_worlds, substeps=substeps, threads=threads)
+def make_sim(
+    num_worlds: int, substeps: int = go2.SUBSTEPS, iterations: int | None = None, threads: int = 0
+) -> Sim:
+    """Worlds of the Go2 on the C engine; see `hmc.go2.model.load_model`."""
+    model = go2.load_model(substeps, iterations)
+    return MujocoSim(model, num_worlds, substeps=substeps, threads=threads)
 
 
 def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
@@ -198,7 +203,8 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
         seed: of the jump's noise and of the ensemble.
         threads: of the engine and the policies; 0 for all cores.
     """
-    sim = partial(make_sim, substeps=cfg.substeps, threads=threads)
+    coarse = {"substeps": cfg.substeps, "iterations": cfg.iterations, "threads": threads}
+    sim = partial(make_sim, **coarse)
     modes = ModeSet(
         [
             Policy(policy_path("footstand", cfg.foot), name="foot", threads=threads),
@@ -207,5 +213,5 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
         ]
     )
     cost = stance_cost(cfg.cost, timeline(cfg.command))
-    others = make_ensemble(cfg.ensemble, seed=seed, substeps=cfg.substeps, threads=threads)
+    others = make_ensemble(cfg.ensemble, seed=seed, **coarse)
     return Task("flip", modes, cost, cfg.horizon, sim, ensemble=others)

@@ -15,7 +15,7 @@ from torch import Tensor
 from hmc import Receding, SwitchSpace, Task, plan
 from hmc.cfg import load
 from hmc.cost import Cost
-from hmc.go2.model import load_model
+from hmc.go2.model import SUBSTEPS, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, jump_mode, make_sim, policy_path
 from hmc.modes import ModeSet
@@ -128,11 +128,11 @@ def _omega(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
 def _replan(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
     """One MPPI update against the bare engine's rollouts of as many worlds and steps."""
     settings = replace(cfg.task.jump.sampling, samples=30, horizon=40, replan_every=40, worlds=30)
-    sim = partial(make_sim, substeps=cfg.task.substeps, threads=args.threads)
+    sim = partial(make_sim, threads=args.threads)
     mpc = jump_mode(replace(cfg.task.jump, sampling=settings), sim, seed=0)
     x, u = (row[None] for row in flip.disturbed_start(cfg.start, 0))
-    bare = MujocoSim(load_model(), 30, substeps=cfg.task.substeps, threads=args.threads)
-    held = u.expand(30, -1)[:, None].expand(-1, 40 * cfg.task.substeps, -1).contiguous().numpy()
+    bare = MujocoSim(load_model(), 30, substeps=SUBSTEPS, threads=args.threads)
+    held = u.expand(30, -1)[:, None].expand(-1, 40 * SUBSTEPS, -1).contiguous().numpy()
     took: list[list[float]] = [[], []]
     for i in range(3 * args.repeats):
         k = torch.tensor([i])
@@ -154,7 +154,7 @@ def _replan(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
 def _ticks(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
     """The Go2's closed loop as tools/flip.py runs it, around the moment of the command."""
     task = flip_task(cfg.task, threads=args.threads)
-    world, (x, u) = task.make_sim(1), flip.disturbed_start(cfg.start, 0)
+    world, (x, u) = make_sim(1, threads=args.threads), flip.disturbed_start(cfg.start, 0)
     world.reset(x[None], u[None])
     loop = Receding(
         task,
@@ -165,7 +165,7 @@ def _ticks(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
     times, used, naive = [], 0, 0
     for _ in range(args.ticks):
         began = time.perf_counter()
-        tick = loop.tick(world.x()[0], world.u()[0], world.save()[0])
+        tick = loop.tick(world.x()[0], world.u()[0], flip.exact(cfg.task, world))
         times.append(1e3 * (time.perf_counter() - began))
         used, naive = used + tick.plan.control_steps, naive + task.horizon * tick.plan.draws
         world.step(tick.u[None])
