@@ -34,7 +34,7 @@ class Planner(Common):
     Attributes:
         horizon: of the system that costs nothing and of the Go2's search of all of Omega, control steps.
         cartpole_horizon: of the cartpole.
-        samples: switches a batch.
+        samples: switches a batch of the cartpole's converged plan.
         repeats: of what is fast.
         ticks: of the Go2's closed loop, from shortly before the command to flip on.
         set: overrides of cfg/flip.toml.
@@ -42,7 +42,7 @@ class Planner(Common):
 
     horizon: int = 50
     cartpole_horizon: int = 100
-    samples: int = 256
+    samples: int = 16384
     repeats: int = 5
     ticks: int = 20
     set: tuple[str, ...] = ()
