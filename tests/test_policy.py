@@ -129,6 +129,12 @@ def test_metadata(exported, checkpoint):
     assert len(meta["training_config_sha256"]) == 64
 
 
+def test_the_file_names_no_folder_of_the_machine(exported):
+    data = exported.read_bytes()
+    assert str(Path(__file__).parents[1]).encode() not in data
+    assert b"stack_trace" not in data
+
+
 def test_paths_in_metadata_are_portable():
     assert portable(f"{ROOT}/out/flips.pt") == "out/flips.pt"
     assert portable("env.starts.records=/somewhere/else/flips.pt") == "env.starts.records=flips.pt"

@@ -98,6 +98,8 @@ def export(checkpoint: Path, out: Path) -> None:
         "environment_steps": int(data["infos"]["steps"]),
     }
     del model.metadata_props[:]
+    for part in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
+        del part.metadata_props[:]  # stack traces, with the folders of this machine
     for key, value in fields.items():
         model.metadata_props.add(key=key, value=json.dumps(value))
     onnx.save(model, str(partial))
