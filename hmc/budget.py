@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from hmc.ensemble import AnyEvaluator
+from hmc.robust import AnyEvaluator
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ class Meter:
         if self.budget.control_steps is not None:
             used = self.evaluator.control_steps
             left = self.budget.control_steps - used
-            each = max(self.evaluator.task.horizon, used // max(1, self.evaluator.rollouts))
+            rollout = max(self.evaluator.task.horizon, used // max(1, self.evaluator.rollouts))
+            each = rollout * self.evaluator.models
             rooms.append((max(0, left // each), "control_steps"))
         return min(rooms)

@@ -37,12 +37,15 @@ class Evaluator:
         known: a trace from earlier evaluations; where it meets `start` bit for bit, its steps are taken over.
 
     Attributes:
+        models: how many rollouts a schedule takes.
         trunk: what was recorded last.
         rollouts: schedules rolled out so far.
         diverged: schedules among them whose world stopped being finite.
         pruned: schedules among them given up because they were sure to exceed the bound.
         ruled_out: schedules that the task's rules do not allow; their cost is inf.
     """
+
+    models = 1
 
     def __init__(self, task: Task, sim: Sim, start: Start, known: Trace | None = None):
         self.task, self.sim, self.start = task, sim, start

@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from hmc.budget import Budget, Meter
-from hmc.ensemble import make_evaluator
+from hmc.robust import make_evaluator
 from hmc.schedule import Schedule, Switch, SwitchSpace
 from hmc.sim.base import Sim
 from hmc.solvers import ORDERS, SOLVERS, Search, run
@@ -80,7 +80,8 @@ class Plan:
 
     @property
     def gains(self) -> dict[str, float]:
-        """Why these switches: how much each term of the cost changed, the largest fall first."""
+        """Why these switches: how much each term of the cost changed, the largest fall first; NaN where the
+        incumbent diverged."""
         change = {name: value - self.incumbent_terms[name] for name, value in self.terms.items()}
         return dict(sorted(change.items(), key=lambda item: item[1]))
 
@@ -114,7 +115,7 @@ class Plan:
             + (f", {self.ruled_out} schedules against the rules" if self.ruled_out else "")
             + (f"; stopped by {self.stopped_by}" if self.stopped_by else ""),
         ]
-        if self.switches:
+        if self.switches and math.isfinite(self.incumbent_cost):
             lines.append("by term: " + ", ".join(f"{name} {gain:+.4g}" for name, gain in self.gains.items()))
         if self.machine_dependent:
             lines.append(f"{self.stopped_by} is not a count: a run at another speed may find another plan")

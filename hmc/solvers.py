@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hmc.budget import Meter
-from hmc.ensemble import AnyEvaluator
+from hmc.robust import AnyEvaluator
 from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst, tails
 
 
@@ -77,10 +77,8 @@ class Search:
                 self.stopped_by = limit
                 return
             indices = order.take(room)
-            stop = None if self.meter.budget.seconds is None else self.meter.expired
-            costs = self.evaluator.costs(self.space.stitch(self.schedule, indices), self.bound, stop)
+            costs = self._roll(self.space.stitch(self.schedule, indices))
             known = ~costs.isnan()
-            self.meter.draws += int(known.sum())
             self.seen += int(known.sum())
             yield indices, torch.where(known, costs, math.inf)
             if self.stopped_by or not known.all():
@@ -88,10 +86,10 @@ class Search:
                 return
             self.tell()
 
-    def offer(self, indices: Sequence[int], cost: float) -> None:
+    def offer(self, switches: Sequence[Switch], cost: float) -> None:
         """Take note of one switch, or of some that are stitched one after the other, if below `bound`."""
         if cost < self.bound:
-            self._found = tuple(self.space[index] for index in indices), cost
+            self._found = tuple(switches), cost
 
     def look_past(self) -> None:
         """Try switches of a schedule that itself may be worse: a tail, and tails of other modes after it.
@@ -108,12 +106,16 @@ class Search:
         if not later:
             return
         indices = torch.tensor([self.space.index(tail) for tail in later])
-        stop = None if self.meter.budget.seconds is None else self.meter.expired
-        rows = self.space.stitch(self.schedule.stitch(first), indices)
-        costs = self.evaluator.costs(rows, self.bound, stop)
-        self.meter.draws += int((~costs.isnan()).sum())
+        costs = self._roll(self.space.stitch(self.schedule.stitch(first), indices))
         best = costs.nan_to_num(math.inf).argmin()
-        self.offer([self.space.index(first), int(indices[best])], float(costs[best]))
+        self.offer([first, later[int(best)]], float(costs[best]))
+
+    def _roll(self, schedules: Tensor) -> Tensor:
+        """Costs of a batch of draws (n, T), (n,); NaN where the clock cut it short."""
+        stop = None if self.meter.budget.seconds is None else self.meter.expired
+        costs = self.evaluator.costs(schedules, self.bound, stop)
+        self.meter.draws += int((~costs.isnan()).sum())
+        return costs
 
     def accept(self) -> bool:
         """Go on from the switch taken note of: K_def <- (m, mu, nu) u K_def. False if there is none."""
@@ -141,7 +143,7 @@ def sample(search: Search) -> None:
     draws = ORDERS[search.order](search)
     for indices, costs in search.batches(draws):
         best = costs.argmin()
-        search.offer([int(indices[best])], float(costs[best]))
+        search.offer([search.space[int(indices[best])]], float(costs[best]))
         if search.pairs:
             search.look_past()
         if search.found:
@@ -152,7 +154,7 @@ def exhaustive(search: Search) -> None:
     """Problem 5 solved exactly: the best of all of Omega; of equal ones, that of lowest index."""
     for indices, costs in search.batches(InOrder(len(search.space))):
         best = costs.argmin()
-        search.offer([int(indices[best])], float(costs[best]))
+        search.offer([search.space[int(indices[best])]], float(costs[best]))
 
 
 def _tails(search: Search) -> TailsFirst:

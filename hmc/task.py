@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from hmc.cost import Cost
+from hmc.ensemble import Ensemble
 from hmc.modes import ModeSet
 from hmc.rules import Rules
 from hmc.sim.base import Sim
-
-if TYPE_CHECKING:
-    from hmc.ensemble import Ensemble
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hmc import Budget, Ensemble, Member, Schedule, make_start, plan
-from hmc.ensemble import EnsembleEvaluator
+from hmc.robust import EnsembleEvaluator
 from tests.toy import Bad, Push, ToySim, all_schedules, slow_cost, toy_task
 
 HIDDEN = (0.0, 0.4, -0.3)
@@ -94,8 +94,13 @@ def test_a_plan_is_the_best_of_all_for_the_ensemble(tail):
     assert found.cost == pytest.approx(float(ensemble.risk(expected)[0]), rel=1e-12)
     assert found.cost <= found.incumbent_cost
     assert plan(task, X, solver="exhaustive", sim=task.make_sim(5)) == found
-    small = plan(task, X, samples=8, budget=Budget(control_steps=200))
-    assert small.control_steps <= 200 + 2 * 3 * 4
+
+
+@pytest.mark.parametrize("steps", [1, 20, 30, 60, 120, 200])
+def test_a_draw_takes_a_rollout_of_each_member_out_of_the_budget(steps):
+    task = replace(toy_task(4), ensemble=Ensemble(members()))
+    found = plan(task, X, samples=8, pairs=4, budget=Budget(control_steps=steps))
+    assert found.control_steps <= max(steps, 3 * 4), "the incumbent is always rolled out"
 
 
 def test_an_ensemble_of_the_nominal_model_changes_nothing():

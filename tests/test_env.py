@@ -311,13 +311,20 @@ def test_frontier():
 
 
 def test_starts_drawn_in_advance_come_once_and_in_order():
-    env = make_env()
-    env._ahead = None
+    starts = Starts(HANDSTAND, StartsCfg(stance=0.5, way=0.5, home=0.0), CPU)
     torch.manual_seed(3)
-    parts = [env._draw(n) for n in (1, 5, 100, 150, 3)]
+    parts = [starts.draw(n) for n in (1, 5, 100, 150, 3)]
     torch.manual_seed(3)
-    whole = env.starts.sample(env.AHEAD)
+    whole = starts.sample(starts.AHEAD)
     torch.testing.assert_close(torch.cat([part.x for part in parts[:4]]), whole.x)
     assert torch.equal(torch.cat([part.kind for part in parts[:4]]), whole.kind)
     assert len(parts[4].x) == 3
-    assert len(env._draw(1000).x) == 1000
+    assert len(starts.draw(1000).x) == 1000
+
+
+def test_a_resumed_curriculum_draws_its_own_starts():
+    starts = Starts(HANDSTAND, StartsCfg(stance=0.5, way=0.5, home=0.0), CPU)
+    starts.draw(1)
+    far = starts.state_dict()
+    starts.load_state_dict({**far, "success": torch.ones_like(far["success"])})
+    assert starts.draw(200).cell.max() >= 2 * starts.ENERGIES, "cells that were closed before"

@@ -15,7 +15,7 @@ from hmc.go2.observe import anchor_of, observe
 from hmc.go2.stances import STANCES
 from hmc.sim.base import Sim
 from train.rewards import RewardCfg, stage_rewards
-from train.starts import KINDS, STANCE, Start, Starts, StartsCfg
+from train.starts import KINDS, STANCE, Starts, StartsCfg
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,6 @@ class StanceEnv(VecEnv):
         sim: `cfg.worlds` worlds.
     """
 
-    AHEAD = 256  # starts drawn at once; the curriculum moves little in the time that they last
-
     def __init__(self, cfg: EnvCfg, sim: Sim):
         self.cfg, self.sim = cfg, sim
         self.stance = STANCES[cfg.mode]
@@ -92,7 +90,6 @@ class StanceEnv(VecEnv):
         self.max_episode_length = cfg.episode_steps
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.starts = Starts(self.stance, cfg.starts, sim.device)
-        self._ahead: Start | None = None
         self._drawn = (self.starts.shares > 0).nonzero().squeeze(1).tolist()
         noise = cfg.noise
         widths = [noise.gravity] * 3 + [noise.position] * 3 + [noise.velocity] * 3 + [noise.gyro] * 3
@@ -156,16 +153,8 @@ class StanceEnv(VecEnv):
         late = self.episode_length_buf * self.sim.dt > self.cfg.grace
         return touch | (low & (late | (self._kind == STANCE)))
 
-    def _draw(self, n: int) -> Start:
-        """The next n starts. They are drawn in advance: one takes as long as hundreds."""
-        if self._ahead is None or len(self._ahead.kind) < n:
-            self._ahead = self.starts.sample(max(n, self.AHEAD))
-        start = Start(*(part[:n] for part in self._ahead))
-        self._ahead = Start(*(part[n:] for part in self._ahead))
-        return start
-
     def _reset(self, ids: Tensor) -> None:
-        start = self._draw(len(ids))
+        start = self.starts.draw(len(ids))
         self.sim.reset(start.x, start.u, ids)
         self._x, self._u, self._anchor = self._x.clone(), self._u.clone(), self._anchor.clone()
         self._x[ids], self._u[ids] = start.x, start.u

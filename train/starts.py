@@ -75,6 +75,7 @@ class Starts:
 
     WIDTH, ENERGIES = 0.1, 7  # of a place; number of energies
     ENERGY_LOW, ENERGY_HIGH = 0.0, 1.4
+    AHEAD = 256  # sampled at once; the curriculum moves little in the time that they last
     HORIZONTAL = 0.2  # four-legged starts wait until the way is open up to here
 
     def __init__(self, stance: Stance, cfg: StartsCfg, device: torch.device, *, unlocked: bool = False):
@@ -89,14 +90,23 @@ class Starts:
         self.success = torch.zeros(self.places, self.ENERGIES, device=device)
         self.rates = torch.zeros(len(KINDS), device=device)
         self.shares = torch.tensor([cfg.stance, cfg.way, cfg.home, cfg.recorded], device=device)
+        self._ahead: Start | None = None
         self.records: dict[str, Tensor] | None = None
         if cfg.records:
             self.records = _read(ROOT / cfg.records, device)
         elif cfg.recorded > 0:
             raise ValueError("starts.recorded > 0 needs starts.records, the file with the recorded states")
 
+    def draw(self, n: int) -> Start:
+        """The next n starts. They are sampled in advance: one takes as long as hundreds."""
+        if self._ahead is None or len(self._ahead.kind) < n:
+            self._ahead = self.sample(max(n, self.AHEAD))
+        start = Start(*(part[:n] for part in self._ahead))
+        self._ahead = Start(*(part[n:] for part in self._ahead))
+        return start
+
     def sample(self, n: int) -> Start:
-        """Draw n starts."""
+        """n starts as the curriculum stands now."""
         kind = torch.multinomial(self._shares(), n, replacement=True)
         place = torch.ones(n, device=self.device)
         energy = torch.zeros(n, device=self.device)
@@ -159,6 +169,7 @@ class Starts:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Go on from a checkpoint."""
+        self._ahead = None
         self.success.copy_(state["success"])
         self.rates.copy_(state["rates"])
 
