@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ class Branches:
 
     Attributes:
         row: which of the given schedules each branch is, (n,) long.
-        modes: those schedules in order of the branches, (n, T) long.
+        modes: those schedules in order of the branches, (n, T).
         parent: the branch that each parts from, (n,) long; -1 for the trunk.
         born: how many branches are born before step i, for i = 0 ... T + 1. Those of step T differ from
             their parent nowhere.
@@ -30,42 +31,92 @@ class Branches:
     parent: Tensor
     born: list[int]
 
+    def path(self, row: int) -> list[int]:
+        """The branch that a given schedule is at each step i = 0 ... T; -1 while it is the trunk."""
+        path, stop, branch = [-1] * (len(self.born) - 1), len(self.born) - 1, int((self.row == row).nonzero())
+        while branch >= 0:
+            birth = bisect(self.born, branch) - 1
+            path[birth:stop] = [branch] * (stop - birth)
+            stop, branch = birth, int(self.parent[branch])
+        return path
+
 
 def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
-    """The tree of schedules (n, T) long, with modes below 256 or not, around `trunk` (t modes)."""
-    horizon = schedules.shape[1]
-    wide = schedules.numpy()
-    order = in_order(wide, trunk)
-    rows = wide[order]
-    lead = np.zeros((1, horizon), dtype=rows.dtype)
-    lead[0, : len(trunk)] = trunk
-    apart = np.vstack([lead, rows[:-1]]) != rows  # each from the one before
-    apart[:1, len(trunk) :] = True
-    birth = np.where(apart.any(1), apart.argmax(1), horizon)
-    # the parent of a branch is the last one before it that was there earlier: its neighbour's ancestor
-    parent = np.full(len(rows), -1)
-    for j, here in enumerate(birth.tolist()):
-        above = j - 1
-        while above >= 0 and birth[above] >= here:
-            above = int(parent[above])
-        parent[j] = above
-    slots = np.argsort(birth, kind="stable")
+    """The tree of schedules (n, T), mode indices, around `trunk` (t modes)."""
+    n, horizon = schedules.shape
+    order = in_order(schedules, trunk)
+    rows = _steps(schedules)[:, order]
+    before = np.empty_like(rows)  # the one before each; the first comes after the trunk
+    before[:, 1:], before[: len(trunk), 0], before[len(trunk) :, 0] = rows[:, :-1], trunk, -1
+    apart = before != rows
+    birth = np.where(apart.any(0), apart.argmax(0), horizon)
+    slots = np.argsort(birth.astype(rows.dtype), kind="stable")
     rank = np.empty_like(slots)
-    rank[slots] = np.arange(len(slots))
-    stems = parent[slots]
-    counts = np.bincount(birth, minlength=horizon + 1)
+    rank[slots] = np.arange(n)
+    born = [0, *np.cumsum(np.bincount(birth, minlength=horizon + 1)).tolist()]
+    # the parent of a branch is the last one before it that was there earlier: its neighbour's ancestor
+    parent = np.full(n, -1)
+    for i in range(horizon + 1):
+        here = slots[born[i] : born[i + 1]]
+        if len(here) > 0 and born[i] > 0:
+            there = np.flatnonzero(birth < i)
+            last = np.searchsorted(there, here) - 1
+            parent[born[i] : born[i + 1]] = np.where(last < 0, -1, rank[there[last]])
     return Branches(
         row=torch.from_numpy(order[slots]),
-        modes=torch.from_numpy(rows[slots]),
-        parent=torch.from_numpy(np.where(stems < 0, -1, rank[stems])),
-        born=[0, *np.cumsum(counts).tolist()],
+        modes=torch.from_numpy(rows[:, slots]).T,
+        parent=torch.from_numpy(parent),
+        born=born,
     )
 
 
-def in_order(schedules: np.ndarray, trunk: Sequence[int]) -> np.ndarray:
+def added_steps(schedules: Tensor, trunk: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Steps that each of schedules (n, T) adds to `trunk` and those before it, and to `trunk` alone, (n,)."""
+    n, horizon = schedules.shape
+    order = in_order(schedules, trunk)
+    rows = _steps(schedules)[:, order]
+    # what each, in order, shares with the one before; `most` is with the trunk, which is always there
+    apart = rows[:, 1:] != rows[:, :-1]
+    shared = [0, *np.where(apart.any(0), apart.argmax(0), horizon).tolist(), 0]
+    lead = rows[: len(trunk)] != np.asarray(trunk, dtype=rows.dtype)[:, None]
+    most = np.vstack([lead, np.ones((1, n), dtype=bool)]).argmax(0)
+    # taken away from the last one to the first, each one's neighbours are of those that come before it
+    before, after = list(range(-1, n - 1)), list(range(1, n + 1))
+    place = np.argsort(order, kind="stable")
+    alike = np.zeros(n, dtype=np.int64)
+    for j in reversed(place.tolist()):
+        above, below = before[j], after[j]
+        left, right = shared[j], shared[below]
+        alike[j] = max(left, right)
+        shared[below] = min(left, right)
+        if below < n:
+            before[below] = above
+        if above >= 0:
+            after[above] = below
+    return horizon - np.maximum(alike, most)[place], horizon - most[place]
+
+
+def in_order(schedules: Tensor, trunk: Sequence[int]) -> np.ndarray:
     """Order of schedules (n, T) with common beginnings side by side, those nearest to the trunk first."""
+    steps = _steps(schedules)
+    horizon, n = steps.shape
     # the trunk's mode becomes the first of each step's alphabet, so that the trunk sorts before all others
-    swapped = schedules.copy()
-    known = swapped[:, : len(trunk)]
-    known[known == np.asarray(trunk, dtype=known.dtype)] = -1
-    return np.lexsort(swapped.T[::-1])
+    swapped, lead = steps + 1, np.asarray(trunk, dtype=steps.dtype)[:, None]
+    known = swapped[: len(trunk)]
+    known[known == lead + 1] = 0
+    # a word holds as many steps as fit, the first one in its highest bits
+    bits = int(swapped.max(initial=1)).bit_length()
+    fit = 64 // bits
+    words = -(-horizon // fit)
+    padded = np.zeros((words * fit, n), dtype=np.uint64)
+    padded[:horizon] = swapped
+    packed = padded.reshape(words, fit, n)
+    keys = packed[:, 0]
+    for step in range(1, fit):
+        keys = keys << np.uint64(bits) | packed[:, step]
+    return np.lexsort(keys[::-1])
+
+
+def _steps(schedules: Tensor) -> np.ndarray:
+    """Schedules (n, T) as (T, n), a step's modes side by side."""
+    return np.ascontiguousarray(schedules.numpy().T)

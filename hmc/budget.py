@@ -5,6 +5,9 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
+import numpy as np
+from torch import Tensor
+
 from hmc.robust import AnyEvaluator
 
 
@@ -14,7 +17,7 @@ class Budget:
 
     The incumbent is always rolled out, whatever the budget. Beyond that, draws are never exceeded, nor
     are control steps where modes make none of their own. What a sampling mode will roll out inside
-    itself is not known before; a batch is cut to what the rollouts before it took. A wall-clock budget is
+    itself is not known before; it is reckoned by what the rollouts before took. A wall-clock budget is
     looked at before every control step; a batch that it cuts short is dropped, and the result may then
     depend on the machine's speed.
 
@@ -54,21 +57,21 @@ class Meter:
         return self.budget.seconds is not None and self.elapsed >= self.budget.seconds
 
     def room(self, wanted: int) -> tuple[int, str]:
-        """How many of `wanted` draws may be evaluated now, and which limit is the tightest.
-
-        A draw is reckoned at its full T control steps, or at what a rollout took so far where modes roll
-        out inside themselves: what pruning and repeats save is seen after the batch, so that the same
-        draws are made whatever the machine.
-        """
+        """How many of `wanted` draws may be made now, and which limit is the tightest."""
         if self.expired():
             return 0, "seconds"
-        rooms = [(wanted, "")]
-        if self.budget.draws is not None:
-            rooms.append((self.budget.draws - self.draws, "draws"))
-        if self.budget.control_steps is not None:
-            used = self.evaluator.control_steps
-            left = self.budget.control_steps - used
-            rollout = max(self.evaluator.task.horizon, used // max(1, self.evaluator.rollouts))
-            each = rollout * self.evaluator.models
-            rooms.append((max(0, left // each), "control_steps"))
-        return min(rooms)
+        if self.budget.draws is not None and self.budget.draws - self.draws < wanted:
+            return self.budget.draws - self.draws, "draws"
+        return wanted, ""
+
+    def affordable(self, schedules: Tensor) -> int:
+        """How many of schedules (n, T), the first ones, the control steps that are left suffice for.
+
+        Where modes roll out inside themselves, a step is reckoned at what one took so far. What pruning
+        saves is seen after the batch, so that the same draws are made whatever the machine.
+        """
+        if self.budget.control_steps is None:
+            return len(schedules)
+        left = self.budget.control_steps - self.evaluator.control_steps
+        needed = self.evaluator.needs(schedules) * self.evaluator.control_steps / self.evaluator.own_steps
+        return int(np.searchsorted(needed, left, side="right"))

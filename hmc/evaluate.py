@@ -7,16 +7,17 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hmc.branches import in_order
-from hmc.rollout import Rolled, roll
+from hmc.branches import added_steps, in_order
+from hmc.rollout import Rolled, record, roll
 from hmc.schedule import Schedule
 from hmc.sim.base import Sim
 from hmc.start import Start
 from hmc.table import Table
 from hmc.task import Task
-from hmc.trace import Trace, record, root
+from hmc.trace import Trace, root
 from hmc.worlds import Worlds
 
 
@@ -37,35 +38,43 @@ class Evaluator:
         known: a trace from earlier evaluations; where it meets `start` bit for bit, its steps are taken over.
 
     Attributes:
-        models: how many rollouts a schedule takes.
-        trunk: what was recorded last.
         rollouts: schedules rolled out so far.
         diverged: schedules among them whose world stopped being finite.
         pruned: schedules among them given up because they were sure to exceed the bound.
         ruled_out: schedules that the task's rules do not allow; their cost is inf.
     """
 
-    models = 1
-
     def __init__(self, task: Task, sim: Sim, start: Start, known: Trace | None = None):
         self.task, self.sim, self.start = task, sim, start
         self.rollouts = self.diverged = self.pruned = self.ruled_out = 0
         self._worlds = Worlds(task, sim)
-        self.trunk = root(self._worlds, start)
-        if known is not None and known.meets(self.trunk):
-            self.trunk = known
+        self._trunk = root(self._worlds, start)
+        if known is not None and known.meets(self._trunk):
+            self._trunk = known
+        self._next: Schedule | None = None  # to be recorded with the next batch
         self._table = Table(len(task.modes), len(task.cost.names))
 
     @property
     def control_steps(self) -> int:
-        """Control steps made so far, over all worlds."""
+        """Control steps made so far, over all worlds and inside the modes."""
         return self._worlds.control_steps
+
+    @property
+    def own_steps(self) -> int:
+        """Those among them that were not made inside a mode."""
+        return self._worlds.own_steps
+
+    @property
+    def trunk(self) -> Trace:
+        """The trace of the schedule followed last."""
+        self._record()
+        return self._trunk
 
     @torch.no_grad()
     def costs(
         self, schedules: Tensor, bound: float = math.inf, stop: Callable[[], bool] | None = None
     ) -> Tensor:
-        """Costs of schedules (N, T) long -> (N,) float64.
+        """Costs of schedules (N, T) -> (N,) float64.
 
         Args:
             schedules: mode indices.
@@ -88,35 +97,65 @@ class Evaluator:
             list(todo), torch.tensor(list(todo.values()), dtype=torch.long), schedules
         )
         if len(fresh) > self.sim.num_worlds:  # neighbours share most: let them be in one chunk
-            order = in_order(schedules[rows].cpu().numpy(), self.trunk.modes[: len(self.trunk)])
+            order = in_order(schedules[rows].cpu(), self._trunk.modes[: len(self._trunk)])
             fresh, rows = [fresh[i] for i in order], rows[order]
-        for first in range(0, len(fresh), self.sim.num_worlds):
-            chunk = slice(first, first + self.sim.num_worlds)
-            rolled = roll(self._worlds, self.trunk, schedules[rows[chunk]], bound, stop)
+        first = 0
+        while first < len(fresh):
+            size = self.sim.num_worlds - (self._next is not None)
+            chunk = slice(first, first + size)
+            modes = None if self._next is None else self._next.modes
+            rolled = roll(self._worlds, self._trunk, schedules[rows[chunk]], bound, stop, modes)
             if rolled is None:
                 break
+            if rolled.trace is not None:
+                self._trunk, self._next = rolled.trace, None
             self._learn(fresh[chunk], rolled)
+            first += size
         return torch.from_numpy(self._table.costs(self._table.find(keys), bound))
+
+    def needs(self, schedules: Tensor) -> NDArray[np.int64]:
+        """Control steps, modes' own aside, that the costs of the first 1, 2, ... of schedules (N, T) take.
+
+        Fewer if some are pruned or barred.
+        """
+        new = self._table.missing(self._table.find(self._table.keys(schedules)), math.inf)
+        wanted, horizon = schedules[torch.from_numpy(new)].cpu(), self.task.horizon
+        ahead = () if self._next is None else (self._next.tensor()[None].to(wanted.dtype),)
+        shared, alone = added_steps(torch.cat([*ahead, wanted]), self._trunk.modes[: len(self._trunk)])
+        # a part that does not fit into the simulator with those before it rolls one beginning out again
+        parts = np.arange(len(shared)) // max(1, self.sim.num_worlds - len(ahead))
+        steps = shared.cumsum() + parts * horizon
+        if self._next is None:
+            steps = np.minimum(steps, alone.cumsum())
+        return np.concatenate([[0], steps])[len(ahead) + new.cumsum()]
 
     @torch.no_grad()
     def follow(self, schedule: Schedule) -> float:
-        """Cost of a schedule that is recorded, so that others are rolled out from where they part from it."""
+        """Cost of a schedule, so that others are rolled out from where they part from it.
+
+        A schedule whose cost is known is recorded together with the next batch, which costs the same number
+        of control steps and less time.
+        """
         rows = schedule.tensor()[None]
         key = self._table.keys(rows)
         found = self._table.find(key)
         known = not bool(self._table.missing(found, math.inf)[0])
-        if not known and found[0] < 0 and not self._allowed(key, torch.tensor([0]), rows)[0]:
+        if known:
+            cost = float(self._table.costs(found, math.inf)[0])
+            self._next = schedule if math.isfinite(cost) and schedule.modes != self._trunk.modes else None
+            if self.sim.num_worlds == 1:  # there is no room beside others
+                self._record()
+            return cost
+        if found[0] < 0 and not self._allowed(key, torch.tensor([0]), rows)[0]:
             return math.inf
-        if known and not math.isfinite(self._table.costs(found, math.inf)[0]):
-            return math.inf
-        self.trunk = record(self._worlds, self.trunk, schedule)
-        if not known:
-            self.rollouts += 1
-            self.ruled_out += self.trunk.barred
-            self.diverged += not (math.isfinite(self.trunk.cost) or self.trunk.barred)
-            terms = self.trunk.terms.cpu().numpy()
-            self._table.learn(key, np.array([self.trunk.cost]), np.array([False]), terms[None])
-        return self.trunk.cost
+        self._next = schedule
+        trunk = self.trunk
+        self.rollouts += 1
+        self.ruled_out += trunk.barred
+        self.diverged += not (math.isfinite(trunk.cost) or trunk.barred)
+        terms = trunk.terms.cpu().numpy()
+        self._table.learn(key, np.array([trunk.cost]), np.array([False]), terms[None])
+        return trunk.cost
 
     def cost(self, schedule: Schedule) -> float:
         """Cost of one schedule."""
@@ -131,7 +170,11 @@ class Evaluator:
 
     def trace(self, schedule: Schedule) -> Trace:
         """The trajectory of one schedule; its control steps are not counted."""
-        return record(Worlds(self.task, self.sim), self.trunk, schedule)
+        return record(Worlds(self.task, self.sim), self._trunk, schedule)
+
+    def _record(self) -> None:
+        if self._next is not None:
+            self._trunk, self._next = record(self._worlds, self._trunk, self._next), None
 
     def _allowed(self, keys: list[bytes], rows: Tensor, schedules: Tensor) -> tuple[list[bytes], Tensor]:
         """The keys and rows of schedules that break no rule; what breaks one is known to cost inf."""

@@ -6,7 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.ensemble import Member
@@ -28,7 +30,6 @@ class EnsembleEvaluator:
     def __init__(self, task: Task, sim: Sim, start: Start):
         assert task.ensemble is not None
         self.task, self.start, self.ensemble = task, start, task.ensemble
-        self.models = len(task.ensemble.members)
         self.members = [
             Evaluator(task, each, _disturbed(start, member))
             for member, each in zip(self.ensemble.members, self.ensemble.sims(sim.num_worlds), strict=True)
@@ -43,6 +44,15 @@ class EnsembleEvaluator:
     def control_steps(self) -> int:
         """Control steps made so far, over all members."""
         return sum(member.control_steps for member in self.members)
+
+    @property
+    def own_steps(self) -> int:
+        """Those among them that were not made inside a mode."""
+        return sum(member.own_steps for member in self.members)
+
+    def needs(self, schedules: Tensor) -> NDArray[np.int64]:
+        """As `Evaluator.needs`, over all members."""
+        return np.sum([member.needs(schedules) for member in self.members], axis=0)
 
     @property
     def rollouts(self) -> int:

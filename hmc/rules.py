@@ -58,6 +58,7 @@ class Rules:
             mode: the mode now running; None if none is.
             ran: control steps that it has been running; None for long enough.
         """
+        schedules = schedules.long()
         n, horizon = schedules.shape
         first = schedules[:, :1] if mode is None else torch.full_like(schedules[:, :1], mode)
         before = torch.cat([first, schedules[:, :-1]], 1)

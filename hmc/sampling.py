@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hmc.cost import Cost
+from hmc.cost import Cost, total
 from hmc.modes import Mode
 from hmc.sim.base import Sim, rollout
 
@@ -322,11 +322,9 @@ class SamplingMpc(Mode):
         steps = k[:, None] + torch.arange(horizon, device=k.device)
         rows = states[:, :-1].reshape(n * horizon, -1), controls.reshape(n * horizon, -1)
         terms = self.cost.stage_terms(*rows, before.reshape(n * horizon, -1), steps.reshape(-1))
-        total = x.new_zeros(n)
-        for stage in (terms.sum(1) * sim.dt).reshape(n, horizon).unbind(1):  # in this order at any n
-            total = total + stage
         self.control_steps += n * horizon
-        return total + self.cost.terminal_terms(states[:, -1], k + horizon).sum(1)
+        stages = total((total(terms) * sim.dt).reshape(n, horizon))  # in this order at any n
+        return stages + total(self.cost.terminal_terms(states[:, -1], k + horizon))
 
 
 def _interpolate(at: Tensor, knots: int) -> Tensor:

@@ -163,11 +163,12 @@ class SwitchSpace:
         return mode, start, duration
 
     def stitch(self, schedule: Schedule, indices: Tensor) -> Tensor:
-        """`schedule` with each of the switches `indices` (N,) in turn, (N, T) long."""
-        mode, start, duration = (part[:, None] for part in self.split(indices))
-        k = torch.arange(self.horizon)
+        """`schedule` with each of the switches `indices` (N,) in turn, (N, T), in a type that fits."""
+        small = torch.int16 if max(self.num_modes, self.horizon) < 2**15 else torch.long
+        mode, start, duration = (part.to(small) for part in self.split(indices))
+        k = torch.arange(self.horizon, dtype=small)[:, None]
         inside = (start <= k) & (k < start + duration)
-        return torch.where(inside, mode, schedule.tensor())
+        return torch.where(inside, mode, schedule.tensor()[:, None].to(small)).T
 
 
 class Draws:

@@ -69,15 +69,19 @@ class Search:
 
     def batches(self, order: Draws | TailsFirst | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
         """Switches of Omega in an order, N at a time: indices and costs, (n,) each; inf if not known."""
-        while order.left > 0:
-            if self.meter.room(2)[0] > 1:  # one is the recording's
-                self.evaluator.follow(self.schedule)
-            room, limit = self.meter.room(self.samples)
+        waiting = torch.empty(0, dtype=torch.long)
+        self.evaluator.follow(self.schedule)
+        while order.left > 0 or len(waiting) > 0:
+            waiting = torch.cat([waiting, order.take(self.samples - len(waiting))])
+            room, limit = self.meter.room(len(waiting))
+            schedules = self.space.stitch(self.schedule, waiting[:room])
+            if room > 0 and (n := self.meter.affordable(schedules)) < room:
+                room, limit = n, "control_steps"
             if room <= 0:
                 self.stopped_by = limit
                 return
-            indices = order.take(room)
-            costs = self._roll(self.space.stitch(self.schedule, indices))
+            indices, waiting = waiting[:room], waiting[room:]
+            costs = self._roll(schedules[:room])
             known = ~costs.isnan()
             self.seen += int(known.sum())
             yield indices, torch.where(known, costs, math.inf)
@@ -106,7 +110,10 @@ class Search:
         if not later:
             return
         indices = torch.tensor([self.space.index(tail) for tail in later])
-        costs = self._roll(self.space.stitch(self.schedule.stitch(first), indices))
+        schedules = self.space.stitch(self.schedule.stitch(first), indices)
+        costs = self._roll(schedules[: self.meter.affordable(schedules)])
+        if len(costs) == 0:
+            return
         best = costs.nan_to_num(math.inf).argmin()
         self.offer([first, later[int(best)]], float(costs[best]))
 

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hmc.cost import total
 from hmc.schedule import Schedule
 from hmc.start import Start
 from hmc.task import Task
-from hmc.worlds import Worlds, finite, stage_terms, total
+from hmc.worlds import Worlds
 
 # What a situation is, a row a step: a world put there goes on bit for bit.
 SITUATION = ("x", "u", "memory", "mode", "snapshots")
@@ -99,10 +100,18 @@ class Trace:
 
     def _ran(self, i: int) -> int | None:
         """How long the mode on arrival at step i has been running."""
-        since = next((j for j in range(i, 0, -1) if self.mode[j] != self.mode[j - 1]), 0)
+        since = self._since[i]
         if since > 0:
             return i - since + 1
         return None if self.ran is None else i + self.ran
+
+    @cached_property
+    def _since(self) -> list[int]:
+        """The row in which the mode on arrival at each step appeared."""
+        modes, since = self.mode.tolist(), [0]
+        for i in range(1, len(modes)):
+            since.append(i if modes[i] != modes[i - 1] else since[-1])
+        return since
 
     def since(self, i: int) -> Self:
         """The rest of this trace from its step i on, as the trace of the rest of its schedule."""
@@ -139,55 +148,56 @@ def root(worlds: Worlds, start: Start) -> Trace:
     )
 
 
-@torch.no_grad()
-def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
-    """Roll out `schedule` in world 0 from where `known` begins, and record it.
+class Recorder:
+    """Takes down the trace of one world of many while they are rolled out.
 
-    The steps in which the two schedules agree are taken over from `known`.
+    Args:
+        known: the trace of an earlier schedule from the same start.
+        modes: the schedule, T mode indices.
+
+    Attributes:
+        agree: steps that are taken over from `known`, in which the two schedules agree.
     """
-    modes = tuple(schedule)
-    if modes == known.modes:
-        return known
-    task, sim = worlds.task, worlds.sim
-    pairs = zip(modes, known.modes[: len(known)], strict=False)
-    agree = next((i for i, (ours, theirs) in enumerate(pairs) if ours != theirs), min(len(modes), len(known)))
-    zero = torch.zeros(1, dtype=torch.long, device=sim.device)
-    worlds.reset(known.start(agree), zero)
-    rows = [tuple(getattr(known, part)[: agree + 1] for part in SITUATION)]
-    stage, sums = [known.stage[:agree]], known.sums[agree : agree + 1]
-    terminal, barred = torch.full_like(known.terminal, math.nan), False
-    for i in range(agree, len(modes) + 1):
-        x, u_prev, k = rows[-1][0][-1:], rows[-1][1][-1:], torch.full_like(zero, known.k + i)
-        if not finite(x).all():
-            break
-        if i == len(modes):
-            terminal = task.cost.terminal_terms(x, k).to(torch.float64)[0]
-            break
-        chosen = torch.full_like(zero, modes[i])
-        if barred := bool(worlds.barred(zero, chosen, x, k).any()):
-            break
-        u = worlds.act(zero, chosen, x, u_prev, k)
-        terms = stage_terms(task, x, u, u_prev, k, sim.dt)
-        sums = sums + terms
-        if not (finite(u) & finite(sums)).all():
-            break
-        stage.append(terms)
-        sim.step(u, zero)
-        worlds.control_steps += 1
-        rows.append(_situation(worlds, zero))
-    situation = {
-        part: torch.cat(column) for part, column in zip(SITUATION, zip(*rows, strict=True), strict=True)
-    }
-    return Trace(
-        task,
-        modes,
-        known.k,
-        stage=torch.cat(stage),
-        terminal=terminal,
-        ran=known.ran,
-        barred=barred,
-        **situation,
-    )
+
+    def __init__(self, known: Trace, modes: tuple[int, ...]):
+        self.known, self.modes = known, modes
+        pairs = zip(modes, known.modes[: len(known)], strict=False)
+        self.agree = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+        self._rows = [tuple(getattr(known, part)[: self.agree + 1] for part in SITUATION)]
+        self._stage = [known.stage[: self.agree]]
+        self._terminal, self._barred = torch.full_like(known.terminal, math.nan), False
+
+    def arrive(self, worlds: Worlds, world: int) -> None:
+        """World number `world` has come to the next step."""
+        self._rows.append(_situation(worlds, torch.tensor([world], device=worlds.sim.device)))
+
+    def step(self, stage: Tensor) -> None:
+        """Its stage terms in this step, (number of stage terms,)."""
+        self._stage.append(stage[None])
+
+    def end(self, terminal: Tensor) -> None:
+        """Its terminal terms, (number of terminal terms,)."""
+        self._terminal = terminal
+
+    def bar(self) -> None:
+        """A guard bars its next mode."""
+        self._barred = True
+
+    def trace(self) -> Trace:
+        """What was recorded."""
+        parts = zip(SITUATION, zip(*self._rows, strict=True), strict=True)
+        situation = {part: torch.cat(column) for part, column in parts}
+        known = self.known
+        return Trace(
+            known.task,
+            self.modes,
+            known.k,
+            stage=torch.cat(self._stage),
+            terminal=self._terminal,
+            ran=known.ran,
+            barred=self._barred,
+            **situation,
+        )
 
 
 def _situation(worlds: Worlds, ids: Tensor) -> tuple[Tensor, ...]:

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hmc.branches import branches, in_order
+from hmc.branches import added_steps, branches, in_order
 
 
 @given(data=st.data(), modes=st.integers(1, 300), horizon=st.integers(1, 8), n=st.integers(1, 40))
@@ -29,10 +29,35 @@ def test_branches_are_the_prefix_tree(data, modes, horizon, n):
         new = {tuple(branch[:i]) for i in range(birth[j] + 1, horizon + 1)}
         assert not new & seen, "no beginning twice"
         seen |= new
+    for number, one in enumerate(rows):
+        path = tree.path(number)
+        assert len(path) == horizon + 1
+        for i, j in enumerate(path):  # at step i it is known by its modes so far, or still the trunk
+            if j >= 0:
+                assert birth[j] <= i
+                assert tree.modes[j].tolist()[:i] == one[:i]
+            else:
+                assert trunk[:i] == one[:i]
+        assert tree.row[path[-1]] == number
     every = {tuple(branch[:i]) for branch in rows for i in range(horizon + 1)}
     assert every <= seen
 
 
 def test_neighbours_in_order_share_most():
-    rows = torch.tensor([[1, 0, 0], [0, 1, 1], [1, 0, 1], [0, 1, 0], [2, 2, 2]]).numpy()
+    rows = torch.tensor([[1, 0, 0], [0, 1, 1], [1, 0, 1], [0, 1, 0], [2, 2, 2]])
     assert in_order(rows, [1, 0, 1]).tolist() == [2, 0, 1, 3, 4]
+
+
+@given(data=st.data(), modes=st.integers(1, 4), horizon=st.integers(1, 6), n=st.integers(0, 20))
+def test_added_steps_are_the_new_beginnings(data, modes, horizon, n):
+    mode = st.integers(0, modes - 1)
+    rows = data.draw(st.lists(st.lists(mode, min_size=horizon, max_size=horizon), min_size=n, max_size=n))
+    trunk = data.draw(st.lists(mode, max_size=horizon))
+    added, alone = added_steps(torch.tensor(rows, dtype=torch.long).reshape(n, horizon), trunk)
+    lead = {tuple(trunk[: i + 1]) for i in range(len(trunk))}
+    seen = set(lead)
+    for row, more, by_itself in zip(rows, added.tolist(), alone.tolist(), strict=True):
+        beginnings = {tuple(row[: i + 1]) for i in range(horizon)}
+        assert more == len(beginnings - seen)
+        assert by_itself == len(beginnings - lead)
+        seen |= beginnings

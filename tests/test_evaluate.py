@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -249,6 +250,30 @@ def test_shared_beginnings_change_no_cost(rows, trunk, num_worlds, bounded):
     assert bool((costs[slow > bound] > bound).all())
     if not bounded and num_worlds == 64:
         assert rolled.control_steps == 5 + len(prefixes(rows) - prefixes(torch.tensor([trunk])))
+
+
+@given(
+    rows=st.lists(st.lists(st.integers(0, 2), min_size=5, max_size=5), min_size=1, max_size=30),
+    known=st.lists(st.integers(0, 2), min_size=5, max_size=5),
+    after=st.lists(st.integers(0, 2), min_size=5, max_size=5),
+    num_worlds=st.sampled_from([1, 2, 5, 64]),
+)
+def test_what_a_batch_needs_is_known_before(rows, known, after, num_worlds):
+    """Exactly where it fits into the simulator, else never more; what is recorded beside it counts."""
+    rolled, rows = evaluator(toy_task(5), num_worlds), torch.tensor(rows)
+    rolled.follow(Schedule(tuple(known)))
+    rolled.costs(torch.tensor([after]))
+    rolled.follow(Schedule(tuple(after)))
+    before, needs = rolled.control_steps, rolled.needs(rows)
+    assert len(needs) == len(rows)
+    assert (np.diff(needs) >= 0).all()
+    first = len(rows) // 2
+    rolled.costs(rows[:first])
+    taken = rolled.control_steps - before
+    rolled.costs(rows[first:])
+    if num_worlds == 64 and first > 0 and taken > 0:
+        assert taken == needs[first - 1]
+    assert taken <= (needs[first - 1] if first > 0 else 0)
 
 
 @pytest.mark.parametrize("steps", [0, 1, 4])

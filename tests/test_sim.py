@@ -194,6 +194,25 @@ def test_a_step_of_some_leaves_the_others(sim):
     assert torch.equal(run(sim, u[:, others], others), whole[:, others])
 
 
+def test_a_slice_is_its_indices(sim):
+    """Reading, loading, restarting and stepping; the worlds outside keep every bit."""
+    u, part, ids, others = inputs(sim, 4), slice(1, 4), index(sim, 1, 2, 3), index(sim, 0, 4)
+    for read in (sim.x, sim.u, sim.save):
+        assert torch.equal(read(part), read(ids))
+    whole = run(sim, u)
+    restart(sim)
+    before = sim.save()
+    assert torch.equal(run(sim, u[:, ids], part), whole[:, ids])
+    assert torch.equal(sim.save(others), before[others])
+    after = sim.save()
+    sim.load(before[ids], part)
+    assert torch.equal(sim.save(), torch.cat([after[:1], before[1:4], after[4:]]))
+    sim.reset(start(sim)[ids], rest(sim)[ids], part)
+    assert torch.equal(sim.x(part), start(sim)[ids])
+    with pytest.raises(ValueError, match=r"u must be \(3, "):
+        sim.step(u[0], part)
+
+
 def test_a_rollout_is_its_steps(sim):
     """In one call or step by step: the same states, inputs and snapshots, in the order of the ids."""
     u, ids = inputs(sim, 6), index(sim, 3, 0, 4)

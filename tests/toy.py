@@ -53,7 +53,7 @@ class ToySim:
         p = p + self.dt * v
         p = torch.where(p.abs() > self.blow_up, math.nan, p)
         self.rows[self._at(ids)] = torch.stack([p, v, u[:, 0], h], dim=1)
-        self.stepped.append(list(range(self.num_worlds)) if ids is None else ids.tolist())
+        self.stepped.append(torch.arange(self.num_worlds)[self._at(ids)].tolist())
 
 
 class Push(Mode):

@@ -7,13 +7,16 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from hmc.sim.ids import Ids
+
 
 @runtime_checkable
 class Sim(Protocol):
     """W worlds that step together, singly or in any subset, one control step at a time.
 
-    Every method takes ``ids``, a long tensor of distinct world indices (n,), or None for all worlds
-    in order. Tensors come back as fresh copies on `device`; a sim never hands out a live buffer.
+    Every method takes ``ids``, a long tensor of distinct world indices (n,), a slice of the worlds, or
+    None for all of them in order. Tensors come back as fresh copies on `device`; a sim never hands out
+    a live buffer.
 
     The state x is what a mode and a cost may look at (for MuJoCo: qpos then qvel). The input u that
     was applied last is part of a world too: costs and observations need it.
@@ -56,27 +59,27 @@ class Sim(Protocol):
         """Type of x, u and snapshots."""
         ...
 
-    def x(self, ids: Tensor | None = None) -> Tensor:
+    def x(self, ids: Ids = None) -> Tensor:
         """State, (n, nx)."""
         ...
 
-    def u(self, ids: Tensor | None = None) -> Tensor:
+    def u(self, ids: Ids = None) -> Tensor:
         """Input applied last, (n, nu)."""
         ...
 
-    def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+    def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         """Put worlds at state x (n, nx) with last input u (n, nu): no history, time 0."""
         ...
 
-    def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+    def step(self, u: Tensor, ids: Ids = None) -> None:
         """Apply u (n, nu) for one control step of dt seconds."""
         ...
 
-    def save(self, ids: Tensor | None = None) -> Tensor:
+    def save(self, ids: Ids = None) -> Tensor:
         """Snapshot rows, (n, ns)."""
         ...
 
-    def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+    def load(self, rows: Tensor, ids: Ids = None) -> None:
         """Continue from snapshot rows (n, ns)."""
         ...
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from hmc.sim.check import check
+from hmc.sim.ids import Ids, fresh, where
 
 
 @dataclass(frozen=True)
@@ -61,11 +62,11 @@ class CartpoleSim:
             raise ValueError(f"expected dt > 0 and substeps >= 1, got dt={dt}, substeps={substeps}")
         self.params = params or CartpoleParams()
         self._dt, self._substeps = dt, substeps
-        self._rows = torch.zeros(num_worlds, 6, dtype=torch.float64)
+        self._columns = torch.zeros(6, num_worlds, dtype=torch.float64)  # all of one quantity side by side
 
     @property
     def num_worlds(self) -> int:
-        return len(self._rows)
+        return self._columns.shape[1]
 
     @property
     def nx(self) -> int:
@@ -81,52 +82,64 @@ class CartpoleSim:
 
     @property
     def device(self) -> torch.device:
-        return self._rows.device
+        return self._columns.device
 
     @property
     def dtype(self) -> torch.dtype:
-        return self._rows.dtype
+        return self._columns.dtype
 
-    def x(self, ids: Tensor | None = None) -> Tensor:
-        return self.save(ids)[:, :4]
+    def x(self, ids: Ids = None) -> Tensor:
+        return fresh(self._columns[:4], ids, 1).T
 
-    def u(self, ids: Tensor | None = None) -> Tensor:
-        return self.save(ids)[:, 4:5]
+    def u(self, ids: Ids = None) -> Tensor:
+        return fresh(self._columns[4:5], ids, 1).T
 
-    def time(self, ids: Tensor | None = None) -> Tensor:
+    def time(self, ids: Ids = None) -> Tensor:
         """Time since the reset [s], (n,)."""
-        return self.save(ids)[:, 5]
+        return fresh(self._columns[5], ids)
 
-    def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+    def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
         self.load(torch.cat([x, u, torch.zeros_like(x[:, :1])], dim=1).to(self.dtype), ids)
 
-    def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+    def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
-        row = self.save(ids)
         u = u.to(self.dtype)
-        self.load(torch.cat([self.advance(row[:, :4], u), u, row[:, 5:] + self._dt], dim=1), ids)
+        ids = where(ids)
+        self._columns[:4, ids] = self.advance(self._columns[:4, ids].T, u).T
+        self._columns[4, ids] = u[:, 0]
+        self._columns[5, ids] += self._dt
 
     def advance(self, x: Tensor, u: Tensor) -> Tensor:
         """States (n, 4) one control step after x under inputs u (n, 1); differentiable."""
+        theta, p, theta_dot, p_dot = x.unbind(1)
         force = self.params.gear * u[:, 0]
         h = self._dt / self._substeps
         for _ in range(self._substeps):
-            k1 = self._rate(x, force)
-            k2 = self._rate(torch.add(x, k1, alpha=h / 2), force)
-            k3 = self._rate(torch.add(x, k2, alpha=h / 2), force)
-            k4 = self._rate(torch.add(x, k3, alpha=h), force)
-            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
-        return x
+            # the four stages' velocities (v, w) and accelerations (a, b) of pole and cart
+            v1, (a1, b1) = theta_dot, self._rate(theta, theta_dot, force)
+            v2 = torch.add(v1, a1, alpha=h / 2)
+            a2, b2 = self._rate(torch.add(theta, v1, alpha=h / 2), v2, force)
+            v3 = torch.add(v1, a2, alpha=h / 2)
+            a3, b3 = self._rate(torch.add(theta, v2, alpha=h / 2), v3, force)
+            v4 = torch.add(v1, a3, alpha=h)
+            a4, b4 = self._rate(torch.add(theta, v3, alpha=h), v4, force)
+            b = b2 + b3
+            # p is in no rate: its sum (w1 + 2 w2 + 2 w3 + w4) / 6 with w2 = p' + h b1 / 2 and so on
+            p = p + h * torch.add(p_dot, b1 + b, alpha=h / 6)
+            theta = torch.add(theta, torch.add(v1 + v4, v2 + v3, alpha=2), alpha=h / 6)
+            theta_dot = torch.add(theta_dot, torch.add(a1 + a4, a2 + a3, alpha=2), alpha=h / 6)
+            p_dot = torch.add(p_dot, torch.add(b1 + b4, b, alpha=2), alpha=h / 6)
+        return torch.stack([theta, p, theta_dot, p_dot]).T
 
-    def save(self, ids: Tensor | None = None) -> Tensor:
-        return self._rows.clone() if ids is None else self._rows[ids]
+    def save(self, ids: Ids = None) -> Tensor:
+        return fresh(self._columns, ids, 1).T
 
-    def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
-        check(self.num_worlds, ids, rows=(rows, self._rows.shape[1]))
-        self._rows[slice(None) if ids is None else ids] = rows
+    def load(self, rows: Tensor, ids: Ids = None) -> None:
+        check(self.num_worlds, ids, rows=(rows, len(self._columns)))
+        self._columns[:, where(ids)] = rows.T
 
-    def energy(self, ids: Tensor | None = None) -> Tensor:
+    def energy(self, ids: Ids = None) -> Tensor:
         """Mechanical energy, zero at rest with the pole level [J], (n,)."""
         theta, _, theta_dot, p_dot = self.x(ids).unbind(1)
         c = self.params
@@ -135,11 +148,10 @@ class CartpoleSim:
         )
         return kinetic + c.pole_mass * c.gravity * c.pole_length * theta.cos()
 
-    def _rate(self, x: Tensor, force: Tensor) -> Tensor:
-        theta, _, theta_dot, p_dot = x.unbind(1)
+    def _rate(self, theta: Tensor, theta_dot: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Accelerations of pole and cart, (n,) each."""
         c, sin, cos = self.params, theta.sin(), theta.cos()
         pull = c.pole_mass * sin  # the pole's mass along the rail, times what swings it
-        swing = c.pole_length * theta_dot.square() - c.gravity * cos
-        p_ddot = (force + pull * swing) / (c.cart_mass + pull * sin)
-        theta_ddot = (c.gravity * sin - p_ddot * cos) / c.pole_length
-        return torch.stack([theta_dot, p_dot, theta_ddot, p_ddot], dim=1)
+        swing = torch.sub(c.pole_length * theta_dot.square(), cos, alpha=c.gravity)
+        p_ddot = torch.addcmul(force, pull, swing) / torch.add(pull * sin, c.cart_mass)
+        return torch.sub(c.gravity * sin, p_ddot * cos) / c.pole_length, p_ddot

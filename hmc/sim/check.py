@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hmc.sim.ids import Ids, count
 
-def check(worlds: int, ids: Tensor | None, **arrays: tuple[Tensor, int]) -> None:
+
+def check(worlds: int, ids: Ids, **arrays: tuple[Tensor, int]) -> None:
     """Raise ValueError unless ids are world indices and each named array is (n, width).
 
     Broadcasting is refused: one row for many worlds is more often a slip than a wish. Indices on a GPU
@@ -14,14 +16,13 @@ def check(worlds: int, ids: Tensor | None, **arrays: tuple[Tensor, int]) -> None
 
     Args:
         worlds: number of worlds W.
-        ids: world indices (n,), or None for all.
+        ids: world indices (n,), a slice of them, or None for all.
         arrays: name = (array, its width).
     """
-    n = worlds
-    if ids is not None:
+    n = count(ids, worlds)
+    if isinstance(ids, Tensor):
         if ids.dtype != torch.long or ids.ndim != 1:
             raise ValueError(f"ids must be a long tensor (n,), got {ids.dtype} {tuple(ids.shape)}")
-        n = len(ids)
         if n and ids.device.type == "cpu" and not (int(ids.min()) >= 0 and int(ids.max()) < worlds):
             raise ValueError(f"ids must be in [0, {worlds}), got {int(ids.min())} to {int(ids.max())}")
     for name, (array, width) in arrays.items():

@@ -8,6 +8,7 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from hmc.sim.check import check
+from hmc.sim.ids import Ids, fresh, where
 
 
 class MujocoSim:
@@ -45,6 +46,7 @@ class MujocoSim:
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._force = self.batch.bind("actuator_force")  # filled by steps after the bind, so bind now
         self._fresh = self._row[0].clone()
+        self._all = torch.arange(num_worlds)
 
     @property
     def num_worlds(self) -> int:
@@ -70,25 +72,25 @@ class MujocoSim:
     def dtype(self) -> torch.dtype:
         return torch.float64
 
-    def x(self, ids: Tensor | None = None) -> Tensor:
-        if ids is None:
-            return torch.cat([self._qpos, self._qvel], dim=1)
-        return torch.cat([self._qpos[ids], self._qvel[ids]], dim=1)
+    def x(self, ids: Ids = None) -> Tensor:
+        return torch.cat([self._qpos[where(ids)], self._qvel[where(ids)]], dim=1)
 
-    def u(self, ids: Tensor | None = None) -> Tensor:
-        return self._ctrl.clone() if ids is None else self._ctrl[ids]
+    def u(self, ids: Ids = None) -> Tensor:
+        return fresh(self._ctrl, ids)
 
-    def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+    def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
-        where = slice(None) if ids is None else ids
-        self._row[where] = self._fresh
-        self._qpos[where] = x[:, : self.model.nq].to(torch.float64)
-        self._qvel[where] = x[:, self.model.nq :].to(torch.float64)
-        self._ctrl[where] = u.to(torch.float64)
+        ids = where(ids)
+        self._row[ids] = self._fresh
+        self._qpos[ids] = x[:, : self.model.nq].to(torch.float64)
+        self._qvel[ids] = x[:, self.model.nq :].to(torch.float64)
+        self._ctrl[ids] = u.to(torch.float64)
 
-    def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+    def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
-        self._ctrl[slice(None) if ids is None else ids] = u.to(torch.float64)
+        self._ctrl[where(ids)] = u.to(torch.float64)
+        if isinstance(ids, slice):
+            ids = self._all[ids]
         # the engine takes indices in ascending order only
         self.batch.step(None if ids is None else ids.sort().values.numpy(), nstep=self._substeps)
 
@@ -105,16 +107,16 @@ class MujocoSim:
         x[:, 1:][stuck] = torch.nan
         return x[order.argsort(), self._substeps - 1 :: self._substeps]
 
-    def save(self, ids: Tensor | None = None) -> Tensor:
-        return self._row.clone() if ids is None else self._row[ids]
+    def save(self, ids: Ids = None) -> Tensor:
+        return fresh(self._row, ids)
 
-    def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+    def load(self, rows: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, rows=(rows, self._row.shape[1]))
-        self._row[slice(None) if ids is None else ids] = rows
+        self._row[where(ids)] = rows
 
-    def actuator_force(self, ids: Tensor | None = None) -> Tensor:
+    def actuator_force(self, ids: Ids = None) -> Tensor:
         """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
-        return torch.tensor(self._force if ids is None else self._force[ids.numpy()])
+        return torch.tensor(self._force)[where(ids)]
 
 
 def _quiet(message: str) -> None:

@@ -12,6 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from hmc.sim.check import check
+from hmc.sim.ids import Ids, count, fresh, where
 from hmc.sim.make import find_device
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # not one line a compiled kernel
@@ -140,36 +141,36 @@ class WarpSim:
     def dtype(self) -> torch.dtype:
         return torch.float32
 
-    def x(self, ids: Tensor | None = None) -> Tensor:
+    def x(self, ids: Ids = None) -> Tensor:
         columns = self._rows[:, self._slices["qpos"].start : self._slices["qvel"].stop]
-        return columns.clone() if ids is None else columns[ids]
+        return fresh(columns, ids)
 
-    def u(self, ids: Tensor | None = None) -> Tensor:
+    def u(self, ids: Ids = None) -> Tensor:
         columns = self._rows[:, self._slices["ctrl"]]
-        return columns.clone() if ids is None else columns[ids]
+        return fresh(columns, ids)
 
-    def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+    def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         check(self._num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
         row = self._fresh.repeat(len(x), 1)
         row[:, self._slices["qpos"].start : self._slices["qvel"].stop] = x.to(row)
         row[:, self._slices["ctrl"]] = u.to(row)
         self.load(row, ids)
 
-    def save(self, ids: Tensor | None = None) -> Tensor:
-        return self._rows.clone() if ids is None else self._rows[ids]
+    def save(self, ids: Ids = None) -> Tensor:
+        return fresh(self._rows, ids)
 
-    def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+    def load(self, rows: Tensor, ids: Ids = None) -> None:
         check(self._num_worlds, ids, rows=(rows, self._rows.shape[1]))
-        self._rows[slice(None) if ids is None else ids] = rows
+        self._rows[where(ids)] = rows
 
-    def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+    def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self._num_worlds, ids, u=(u, self.nu))
-        n = self._num_worlds if ids is None else len(ids)
+        n = count(ids, self._num_worlds)
         if n == 0:
             return
-        where = slice(None) if ids is None else ids
+        ids = where(ids)
         space = self._space(self._size(n))
-        row = self._rows[where]
+        row = fresh(self._rows, ids)
         row[:, self._slices["ctrl"]] = u.to(row)
         space.write(row)
         space.run()
@@ -178,12 +179,12 @@ class WarpSim:
         self._lost += lost.sum(1)
         moving = slice(self._slices["qpos"].start, self._slices["qvel"].stop)
         row[:, moving] = row[:, moving].masked_fill(lost.any(0)[:, None], torch.nan)
-        self._rows[where] = row
-        self._force[where] = space.force[:n]
+        self._rows[ids] = row
+        self._force[ids] = space.force[:n]
 
-    def actuator_force(self, ids: Tensor | None = None) -> Tensor:
+    def actuator_force(self, ids: Ids = None) -> Tensor:
         """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
-        return self._force.clone() if ids is None else self._force[ids]
+        return fresh(self._force, ids)
 
     def overflow(self) -> dict[str, int]:
         """World-steps spoiled since the last call because contacts or constraints did not fit.

@@ -24,6 +24,7 @@ from hmc.go2.task import CostCfg, policy_path, stance_cost
 from hmc.modes import ModeSet
 from hmc.rollout import roll
 from hmc.schedule import Schedule, SwitchSpace
+from hmc.sim.ids import Ids, where
 from hmc.sim.mujoco import MujocoSim
 from hmc.start import make_start
 from hmc.task import Task
@@ -190,9 +191,9 @@ def _evaluator(
     trunk, step = root(worlds, start), sim.step
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def keep(u: Tensor, ids: Tensor | None = None) -> None:
-        ids = torch.arange(args.worlds) if ids is None else ids
-        steps.append((ids.numpy(), sim.save(ids).numpy(), u.numpy()))
+    def keep(u: Tensor, ids: Ids = None) -> None:
+        index = torch.arange(args.worlds)[where(ids)]
+        steps.append((index.numpy(), sim.save(ids).numpy(), u.numpy()))
         step(u, ids)
 
     sim.step = keep  # type: ignore[method-assign]

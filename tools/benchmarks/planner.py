@@ -19,6 +19,7 @@ from hmc.go2.model import SUBSTEPS, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, jump_mode, make_sim, policy_path
 from hmc.modes import ModeSet
+from hmc.sim.ids import Ids, count
 from hmc.sim.mujoco import MujocoSim
 from hmc.tasks.cartpole import CartpoleCfg, ConstantInput, cartpole, initial_state
 from tools import flip
@@ -192,16 +193,16 @@ class NullSim:
     def __init__(self, num_worlds: int):
         self.num_worlds, self._zero = num_worlds, torch.zeros(num_worlds, 1, dtype=self.dtype)
 
-    def x(self, ids: Tensor | None = None) -> Tensor:
-        return self._zero[: self.num_worlds if ids is None else len(ids)]
+    def x(self, ids: Ids = None) -> Tensor:
+        return self._zero[: count(ids, self.num_worlds)]
 
     u = save = x
 
-    def reset(self, x: Tensor, u: Tensor, ids: Tensor | None = None) -> None:
+    def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         pass
 
-    def step(self, u: Tensor, ids: Tensor | None = None) -> None:
+    def step(self, u: Tensor, ids: Ids = None) -> None:
         pass
 
-    def load(self, rows: Tensor, ids: Tensor | None = None) -> None:
+    def load(self, rows: Tensor, ids: Ids = None) -> None:
         pass

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hmc.cfg import load
 from hmc.go2.model import load_model
+from hmc.sim.ids import Ids
 from hmc.sim.mujoco import MujocoSim
 from tools.benchmarks.figures import Common, Figures
 from train.config import ROOT, TrainCfg, rsl_config
@@ -47,7 +48,7 @@ def train(args: Train) -> Figures:
     sim = MujocoSim(load_model(), cfg.env.worlds, threads=args.threads)
     spent, step, entries = [0.0], sim.step, []
 
-    def timed(u: Tensor, ids: Tensor | None = None) -> None:
+    def timed(u: Tensor, ids: Ids = None) -> None:
         began = time.perf_counter()
         step(u, ids)
         spent[0] += time.perf_counter() - began
