@@ -24,12 +24,14 @@ class Branches:
         parent: the branch that each parts from, (n,) long; -1 for the trunk.
         born: how many branches are born before step i, for i = 0 ... T + 1. Those of step T differ from
             their parent nowhere.
+        seeds: how many of those born at step i, the first ones, part from the trunk.
     """
 
     row: Tensor
     modes: Tensor
     parent: Tensor
     born: list[int]
+    seeds: list[int]
 
     def path(self, row: int) -> list[int]:
         """The branch that a given schedule is at each step i = 0 ... T; -1 while it is the trunk."""
@@ -55,18 +57,20 @@ def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
     rank[slots] = np.arange(n)
     born = [0, *np.cumsum(np.bincount(birth, minlength=horizon + 1)).tolist()]
     # the parent of a branch is the last one before it that was there earlier: its neighbour's ancestor
-    parent = np.full(n, -1)
+    parent, seeds = np.full(n, -1), []
     for i in range(horizon + 1):
-        here = slots[born[i] : born[i + 1]]
+        here, stems = slots[born[i] : born[i + 1]], parent[born[i] : born[i + 1]]
         if len(here) > 0 and born[i] > 0:
             there = np.flatnonzero(birth < i)
             last = np.searchsorted(there, here) - 1
-            parent[born[i] : born[i + 1]] = np.where(last < 0, -1, rank[there[last]])
+            stems[:] = np.where(last < 0, -1, rank[there[last]])
+        seeds.append(int((stems < 0).sum()))
     return Branches(
         row=torch.from_numpy(order[slots]),
         modes=torch.from_numpy(rows[:, slots]).T,
         parent=torch.from_numpy(parent),
         born=born,
+        seeds=seeds,
     )
 
 

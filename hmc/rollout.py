@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hmc.branches import branches
+from hmc.branches import Branches, branches
 from hmc.cost import total
-from hmc.sim.base import Sim
 from hmc.sim.ids import Ids, count
 from hmc.trace import Recorder, Trace
 from hmc.worlds import Worlds, finite, stage_terms
@@ -62,100 +61,17 @@ def roll(
         record: a schedule that is rolled out beside the others, whatever the bound, and recorded; the
             simulator has a world for it too.
     """
-    sim, cost = worlds.sim, worlds.task.cost
-    recorder = None if record is None else Recorder(trunk, record)
     rows = schedules.cpu()
     if record is not None:
         rows = torch.cat([torch.tensor([record], dtype=rows.dtype), rows])
     tree = branches(rows, trunk.modes[: len(trunk)])
-    path = tree.path(0) if recorder is not None else []  # the branches that are recorded
-    n, horizon = tree.modes.shape
-    modes, parents = tree.modes.to(sim.device), tree.parent.to(sim.device)
-    limit = bound if cost.nonnegative else math.inf
-    rest = worlds.task.lower_bound if math.isfinite(limit) else None
-    slack = 1e-9 * abs(limit)  # more than rounding can make of partial cost and lower bound
-    limits = torch.full((n,), limit, dtype=torch.float64, device=sim.device)
-    if recorder is not None:
-        limits[[branch for branch in path if branch >= 0]] = math.inf
-    stages, guarded = len(cost.stage), worlds.task.rules is not None and bool(worlds.task.rules.guards)
-    result = torch.full((n,), math.inf, dtype=torch.float64, device=sim.device)
-    terms = torch.zeros(len(cost.names), n, dtype=torch.float64, device=sim.device)
-    pruned = torch.zeros(n, dtype=torch.bool, device=sim.device)
-    barred, going = torch.zeros_like(pruned), torch.zeros_like(pruned)
-    ids: Tensor | slice = slice(0, 0)  # branch j runs in world j: those that are going on
-    for i in range(horizon + 1):
+    recorder = None if record is None else Recorder(trunk, record, tree.path(0))
+    rollout = _Rollout(worlds, trunk, tree, bound, recorder)
+    for i in range(rows.shape[1] + 1):
         if stop is not None and stop():
             return None
-        old, now = tree.born[i], tree.born[i + 1]
-        if now > old:
-            seeds = old + int((parents[old:now] < 0).sum())  # what parts from the trunk comes first
-            if seeds > old:
-                worlds.reset(trunk.start(i), slice(old, seeds))
-                terms[:stages, old:seeds], going[old:seeds] = trunk.sums[i][:, None], True
-            if now > seeds:
-                stems = parents[seeds:now]
-                worlds.branch(stems, slice(seeds, now))
-                terms[:, seeds:now] = terms[:, stems]
-                for each in (result, pruned, barred, going):  # a stem that has ended passes on its end
-                    each[seeds:now] = each[stems]
-            whole = bool(going[:now].all())
-            ids = slice(0, now) if whole else going[:now].nonzero().squeeze(1)
-        watched = path[i] if recorder is not None and path[i] >= 0 and bool(going[path[i]]) else -1
-        if recorder is not None and watched >= 0 and i > recorder.agree:
-            recorder.arrive(worlds, watched)
-        x = sim.x(_worlds(sim, ids))
-        if len(x) > 0 and not bool(x.sum().isfinite()):  # a finite sum has finite parts
-            ids, (x,) = _drop(going, ids, ~finite(x), x)
-        if len(x) == 0:
-            continue
-        k = trunk.k + i
-        if i == horizon:
-            ks = torch.full((len(x),), k, device=sim.device)
-            terms[stages:, ids] = cost.terminal_terms(x, ks).to(torch.float64).T
-            result[ids] = total(terms[:, ids].T)
-            break
-        if guarded and bool((bad := worlds.barred(ids, modes[ids, i].long(), x, k)).any()):
-            barred[_indices(ids)[bad]] = True
-            ids, (x,) = _drop(going, ids, bad, x)
-        if rest is not None:
-            ks = torch.full((len(x),), k, device=sim.device)
-            least = total(terms[:, ids].T) + rest(x, ks, horizon - i).to(torch.float64) - slack
-            if bool((bad := least > limits[ids]).any()):
-                given_up = _indices(ids)[bad]
-                result[given_up], pruned[given_up] = least[bad], True
-                ids, (x,) = _drop(going, ids, bad, x)
-        if len(x) == 0:
-            continue
-        u_prev = sim.u(_worlds(sim, ids))
-        u = worlds.act(ids, modes[ids, i].long(), x, u_prev, k)
-        stage = stage_terms(worlds.task, x, u, u_prev, k, sim.dt).T
-        terms[:stages, ids] += stage
-        partial = total(terms[:, ids].T)
-        most = limits[ids]
-        if recorder is not None and watched >= 0 and bool(going[watched]):
-            place = watched if isinstance(ids, slice) else int((ids == watched).nonzero())
-            if bool((partial[place] + u[place].sum()).isfinite()):
-                recorder.step(stage[:, place])
-        if not (bool((partial.sum() + u.sum()).isfinite()) and bool((partial <= most).all())):
-            sound, beyond = partial.isfinite() & finite(u), partial > most
-            given_up = _indices(ids)[sound & beyond]
-            result[given_up], pruned[given_up] = partial[sound & beyond], True
-            ids, (u,) = _drop(going, ids, ~sound | beyond, u)
-        if len(u) > 0:
-            sim.step(u, _worlds(sim, ids))
-            worlds.own_steps += len(u)
-    result[result.isnan()] = math.inf
-    trace = None
-    if recorder is not None:
-        if bool(going[path[-1]]):
-            recorder.end(terms[stages:, path[-1]].clone())
-        if bool(barred[path[-1]]):
-            recorder.bar()
-        trace = recorder.trace()
-    diverged = ~result.isfinite() & ~pruned & ~barred
-    terms[:, ~result.isfinite() | pruned] = math.nan
-    back = tree.row.argsort().to(sim.device)[n - len(schedules) :]
-    return Rolled(result[back], terms[:, back].T, diverged[back], pruned[back], barred[back], trace)
+        rollout.advance(i)
+    return rollout.rolled(tree.row.argsort()[len(rows) - len(schedules) :])
 
 
 @torch.no_grad()
@@ -174,21 +90,145 @@ def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
     return rolled.trace
 
 
-def _worlds(sim: Sim, ids: Tensor | slice) -> Ids:
-    """Ascending `ids`; None, which costs least, where they are all worlds."""
-    return None if count(ids, sim.num_worlds) == sim.num_worlds else ids
+class _Rollout:
+    """A tree of n branches being rolled out, branch j in world j; arguments as of `roll`."""
 
+    def __init__(self, worlds: Worlds, trunk: Trace, tree: Branches, bound: float, recorder: Recorder | None):
+        task, device, n = worlds.task, worlds.sim.device, len(tree.row)
+        self.worlds, self.sim, self.task, self.trunk, self.tree = worlds, worlds.sim, task, trunk, tree
+        self.recorder = recorder
+        self.modes, self.parents = tree.modes.to(device), tree.parent.to(device)
+        self.horizon, self.stages = tree.modes.shape[1], len(task.cost.stage)
+        self.limit = bound if task.cost.nonnegative else math.inf
+        self.slack = 1e-9 * abs(self.limit)  # more than rounding can make of partial cost and lower bound
+        self.limits = torch.full((n,), self.limit, dtype=torch.float64, device=device)
+        if recorder is not None:
+            self.limits[recorder.branches] = math.inf
+        self.terms = torch.zeros(len(task.cost.names), n, dtype=torch.float64, device=device)
+        self.result = torch.full((n,), math.inf, dtype=torch.float64, device=device)
+        self.going, self.pruned, self.barred = torch.zeros(3, n, dtype=torch.bool, device=device)
+        self.ids: Tensor | slice = slice(0, 0)  # branches that go on; a slice while none has ended
 
-def _indices(ids: Tensor | slice) -> Tensor:
-    return torch.arange(ids.start, ids.stop) if isinstance(ids, slice) else ids
+    def advance(self, i: int) -> None:
+        """Step i of all branches that go on: what is born then, and their end at i = T, included."""
+        task, sim, k = self.task, self.sim, self.trunk.k + i
+        self._grow(i)
+        watched = -1 if self.recorder is None else self.recorder.path[i]
+        if self.recorder is not None and watched >= 0 and bool(self.going[watched]):
+            self.recorder.arrive(self.worlds, i, watched)
+        x = sim.x(self._worlds)
+        if not math.isfinite(float(x.sum())):  # a finite sum has finite parts
+            (x,) = self._drop(~finite(x), x)
+        if len(x) > 0 and i == self.horizon:
+            terminal = task.cost.terminal_terms(x, torch.full((len(x),), k, device=sim.device))
+            self.terms[self.stages :, self.ids] = terminal.to(torch.float64).T
+            self.result[self.ids] = total(self.terms[:, self.ids].T)
+            return
+        if len(x) > 0:
+            x = self._give_up(i, x, k)
+        if len(x) == 0:
+            return
+        u_prev = sim.u(self._worlds)
+        u = self.worlds.act(self.ids, self._modes(i), x, u_prev, k)
+        stage = stage_terms(task, x, u, u_prev, k, sim.dt).T
+        self.terms[: self.stages, self.ids] += stage
+        partial = total(self.terms[:, self.ids].T)
+        if self.recorder is not None and watched >= 0 and bool(self.going[watched]):
+            place = watched if isinstance(self.ids, slice) else int((self.ids == watched).nonzero())
+            if bool((partial[place] + u[place].sum()).isfinite()):
+                self.recorder.step(stage[:, place])
+        if not math.isfinite(float(partial.sum() + u.sum())) or self._beyond(partial).any():
+            (u,) = self._prune(partial, finite(u), u)
+        if len(u) > 0:
+            sim.step(u, self._worlds)
+            self.worlds.own_steps += len(u)
 
+    def rolled(self, rows: Tensor) -> Rolled:
+        """What came of branches `rows`."""
+        self.result[self.result.isnan()] = math.inf
+        ended = ~self.result.isfinite()
+        diverged = ended & ~self.pruned & ~self.barred
+        if self.recorder is not None:
+            last = self.recorder.path[-1]
+            if bool(self.going[last]):
+                self.recorder.end(self.terms[self.stages :, last].clone())
+            if bool(self.barred[last]):
+                self.recorder.bar()
+        self.terms[:, ended | self.pruned] = math.nan
+        rows = rows.to(self.sim.device)
+        return Rolled(
+            self.result[rows],
+            self.terms[:, rows].T,
+            diverged[rows],
+            self.pruned[rows],
+            self.barred[rows],
+            None if self.recorder is None else self.recorder.trace(),
+        )
 
-def _drop(
-    going: Tensor, ids: Tensor | slice, bad: Tensor, *rows: Tensor
-) -> tuple[Tensor | slice, tuple[Tensor, ...]]:
-    """End those of `ids` that are `bad` (n,): the ids that go on, and of `rows`, (n, ...) each, theirs."""
-    if not bool(bad.any()):
-        return ids, rows
-    index = _indices(ids).to(bad.device)
-    going[index[bad]] = False
-    return index[~bad], tuple(each[~bad] for each in rows)
+    @property
+    def _worlds(self) -> Ids:
+        """The worlds of `ids`; None, which costs least, where they are all."""
+        return None if count(self.ids, self.sim.num_worlds) == self.sim.num_worlds else self.ids
+
+    def _modes(self, i: int) -> Tensor:
+        return self.modes[self.ids, i].long()
+
+    def _grow(self, i: int) -> None:
+        """Branches that are born at step i become copies of what they part from."""
+        old, now = self.tree.born[i], self.tree.born[i + 1]
+        if now == old:
+            return
+        seeds = old + self.tree.seeds[i]
+        stems, shoots = self.parents[seeds:now], slice(seeds, now)
+        if seeds > old:
+            self.worlds.reset(self.trunk.start(i), slice(old, seeds))
+            self.terms[: self.stages, old:seeds] = self.trunk.sums[i][:, None]
+        if now > seeds:
+            self.worlds.branch(stems, shoots)
+            self.terms[:, shoots] = self.terms[:, stems]
+        self.going[old:now] = True
+        if isinstance(self.ids, slice):
+            self.ids = slice(0, now)
+            return
+        for each in (self.result, self.pruned, self.barred, self.going):  # a stem that has ended passes it on
+            each[shoots] = each[stems]
+        self.ids = self.going[:now].nonzero().squeeze(1)
+
+    def _give_up(self, i: int, x: Tensor, k: int) -> Tensor:
+        """End what a guard bars and what is sure to exceed its limit; the states of the others."""
+        rules, rest = self.task.rules, self.task.lower_bound
+        if rules is not None and rules.guards:
+            bad = self.worlds.barred(self.ids, self._modes(i), x, k)
+            if bool(bad.any()):
+                self.barred[self._indices[bad]] = True
+                (x,) = self._drop(bad, x)
+        if rest is not None and self.limit < math.inf and len(x) > 0:
+            steps = torch.full((len(x),), k, device=x.device)
+            least = total(self.terms[:, self.ids].T) - self.slack
+            least += rest(x, steps, self.horizon - i).to(torch.float64)
+            if self._beyond(least).any():
+                (x,) = self._prune(least, torch.ones_like(least, dtype=torch.bool), x)
+        return x
+
+    def _beyond(self, cost: Tensor) -> Tensor:
+        """Whose cost so far is too much already, (n,) bool."""
+        return cost > self.limits[self.ids]
+
+    def _prune(self, cost: Tensor, sane: Tensor, *rows: Tensor) -> tuple[Tensor, ...]:
+        """End what is beyond its limit, and what is not `sane` or finite; the `rows` of the others."""
+        sane, beyond = sane & cost.isfinite(), self._beyond(cost)
+        given_up = self._indices[sane & beyond]
+        self.result[given_up], self.pruned[given_up] = cost[sane & beyond], True
+        return self._drop(~sane | beyond, *rows)
+
+    @property
+    def _indices(self) -> Tensor:
+        return torch.arange(len(self.going), device=self.going.device)[self.ids]
+
+    def _drop(self, bad: Tensor, *rows: Tensor) -> tuple[Tensor, ...]:
+        """End those of `ids` that are `bad` (n,); of `rows`, (n, ...) each, those of the others."""
+        if bool(bad.any()):
+            index = self._indices
+            self.going[index[bad]] = False
+            self.ids, rows = index[~bad], tuple(each[~bad] for each in rows)
+        return rows

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import takewhile
 from typing import Any, Self
 
 import numpy as np
@@ -154,22 +153,25 @@ class Recorder:
     Args:
         known: the trace of an earlier schedule from the same start.
         modes: the schedule, T mode indices.
-
-    Attributes:
-        agree: steps that are taken over from `known`, in which the two schedules agree.
+        path: the world that it is in at each step i = 0 ... T; -1 as long as it agrees with `known`.
     """
 
-    def __init__(self, known: Trace, modes: tuple[int, ...]):
-        self.known, self.modes = known, modes
-        pairs = zip(modes, known.modes[: len(known)], strict=False)
-        self.agree = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+    def __init__(self, known: Trace, modes: tuple[int, ...], path: list[int]):
+        self.known, self.modes, self.path = known, modes, path
+        self.agree = next(i for i, world in enumerate(path) if world >= 0)
         self._rows = [tuple(getattr(known, part)[: self.agree + 1] for part in SITUATION)]
         self._stage = [known.stage[: self.agree]]
         self._terminal, self._barred = torch.full_like(known.terminal, math.nan), False
 
-    def arrive(self, worlds: Worlds, world: int) -> None:
-        """World number `world` has come to the next step."""
-        self._rows.append(_situation(worlds, torch.tensor([world], device=worlds.sim.device)))
+    @property
+    def branches(self) -> list[int]:
+        """The worlds that it is in, one after the other."""
+        return list(dict.fromkeys(self.path[self.agree :]))
+
+    def arrive(self, worlds: Worlds, i: int, world: int) -> None:
+        """World number `world` has come to step i."""
+        if i > self.agree:  # there it is what `known` says
+            self._rows.append(_situation(worlds, torch.tensor([world], device=worlds.sim.device)))
 
     def step(self, stage: Tensor) -> None:
         """Its stage terms in this step, (number of stage terms,)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -46,8 +46,9 @@ class Worlds:
             self.sim.load(start.snapshot.expand(n, -1), ids)
         ids = where(ids)
         self.mode[ids] = -1 if start.mode is None else start.mode
-        self.memory[ids] = 0.0
-        self.memory[ids, : len(start.memory)] = start.memory
+        if self.task.modes.memory_size > 0:
+            self.memory[ids] = 0.0
+            self.memory[ids, : len(start.memory)] = start.memory
 
     def branch(self, parents: Tensor, children: Ids) -> None:
         """Make worlds `children` (n,) copies of worlds `parents` (n,)."""
@@ -78,63 +79,59 @@ class Worlds:
         Returns:
             The inputs to apply, (n, nu). The worlds' memory is already that after the step.
         """
-        groups, ids, ks = _groups(modes, len(self.task.modes)), where(ids), torch.full_like(modes, k)
-        remembers = self.task.modes.memory_size > 0
-        memory = self._arrive(ids, modes, groups, x, u, ks) if remembers else self.memory[ids]
-        action = torch.empty_like(u)
+        n, ids, remembers = len(modes), where(ids), self.task.modes.memory_size > 0
+        memory, entered = fresh(self.memory, ids), modes != self.mode[ids]
+        order, groups = _groups(modes, len(self.task.modes))
+        if order is not None:  # side by side, what is in one mode needs no more indexing
+            x, u, entered = x[order], u[order], entered[order]
+            memory = memory[order] if remembers else memory
+        if remembers:
+            memory[entered] = 0.0
+        ks, actions = torch.full((n,), k, device=modes.device), []
         for index, rows in groups:
             mode = self.task.modes[index]
-            size = mode.memory_size
-            nested, now = mode.control_steps, x[rows]
-            n = len(now)
-            chosen, after = mode.act(now, u[rows], memory[rows, :size], ks[:n])
-            self.nested_steps += mode.control_steps - nested
-            action[rows] = _shaped(mode, "act() actions", chosen, (n, self.sim.nu)).to(u.dtype)
-            if size > 0:
-                memory[rows, :size] = _shaped(mode, "act() memory", after, (n, size)).to(memory.dtype)
+            actions.append(self._act(mode, x[rows], u[rows], memory[rows], entered[rows], ks[rows]))
+        action = torch.cat(actions) if len(actions) > 1 else actions[0]
+        if order is not None:
+            action = torch.empty_like(action).index_copy_(0, order, action)
+            memory = torch.empty_like(memory).index_copy_(0, order, memory) if remembers else memory
         self.mode[ids] = modes
         if remembers:
             self.memory[ids] = memory
         return action
 
-    def _arrive(
-        self, ids: Tensor | slice, modes: Tensor, groups: Groups, x: Tensor, u: Tensor, k: Tensor
-    ) -> Tensor:
-        """Memory at the start of the step, (n, memory_size): made anew where a world changes mode."""
-        memory = fresh(self.memory, ids)
-        entered = modes != self.mode[ids]
-        if bool(entered.any()):
-            memory[entered] = 0.0
-            for index, rows in groups:
-                mode = self.task.modes[index]
-                size = mode.memory_size
-                if size > 0 and len(new := _where(entered, rows)) > 0:
-                    start = mode.reset(x[new], u[new], k[: len(new)])
-                    start = _shaped(mode, "reset() memory", start, (len(new), size))
-                    memory[new, :size] = start.to(memory.dtype)
-        return memory
+    def _act(self, mode: Mode, x: Tensor, u: Tensor, memory: Tensor, entered: Tensor, k: Tensor) -> Tensor:
+        """Inputs of worlds that are all in one mode, (n, nu); their `memory` is brought up to date."""
+        n, size = len(x), mode.memory_size
+        memory = memory[:, :size]
+        if size > 0 and bool(entered.any()):
+            start = mode.reset(x[entered], u[entered], k[entered])
+            start = _shaped(mode, "reset() memory", start, (int(entered.sum()), size))
+            memory[entered] = start.to(memory.dtype)
+        nested = mode.control_steps
+        action, after = mode.act(x, u, memory, k)
+        self.nested_steps += mode.control_steps - nested
+        if size > 0:
+            memory[:] = _shaped(mode, "act() memory", after, (n, size))
+        return _shaped(mode, "act() actions", action, (n, self.sim.nu)).to(u.dtype)
 
 
-# the modes at work, each with its rows
-Groups: TypeAlias = list[tuple[int, Tensor | slice]]
+def _groups(modes: Tensor, size: int) -> tuple[Tensor | None, list[tuple[int, slice]]]:
+    """An order of `modes` (n,), of `size` that there are, and the stretch of each mode in it.
 
-
-def _groups(modes: Tensor, size: int) -> Groups:
-    """The modes in `modes` (n,), of `size` that there are, in ascending order; a slice where one has all."""
-    if len(modes) == 1 or bool((modes == modes[0]).all()):
-        return [(int(modes[0]), slice(None))]
+    None for the order where one mode has all.
+    """
     counts = modes.bincount(minlength=size).tolist()
+    ends = list(accumulate(counts))
+    groups = [
+        (index, slice(end - n, end)) for index, (n, end) in enumerate(zip(counts, ends, strict=True)) if n
+    ]
+    if len(groups) == 1:
+        return None, groups
     if modes.device.type == "cpu":  # by counting, which torch does not for so few values
         small = np.uint8 if size <= 256 else np.uint16 if size <= 65536 else np.int64
-        order = torch.from_numpy(modes.numpy().astype(small).argsort(kind="stable"))
-    else:
-        order = modes.argsort(stable=True)
-    return [(index, rows) for index, rows in enumerate(order.split(counts)) if len(rows) > 0]
-
-
-def _where(mask: Tensor, rows: Tensor | slice) -> Tensor:
-    """Those of `rows` where `mask` (n,) holds."""
-    return mask.nonzero().squeeze(1) if isinstance(rows, slice) else rows[mask[rows]]
+        return torch.from_numpy(modes.numpy().astype(small).argsort(kind="stable")), groups
+    return modes.argsort(stable=True), groups
 
 
 def _shaped(mode: Mode, what: str, value: Tensor, shape: tuple[int, int]) -> Tensor:
