@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import accumulate
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -87,10 +85,11 @@ class Worlds:
             memory = memory[order] if remembers else memory
         if remembers:
             memory[entered] = 0.0
-        ks, actions = torch.full((n,), k, device=modes.device), []
-        for index, rows in groups:
-            mode = self.task.modes[index]
-            actions.append(self._act(mode, x[rows], u[rows], memory[rows], entered[rows], ks[rows]))
+        ks = torch.full((n,), k, device=modes.device)
+        parts = zip(
+            groups, *(each.split(list(groups.values())) for each in (x, u, memory, entered, ks)), strict=True
+        )
+        actions = [self._act(self.task.modes[index], *part) for index, *part in parts]
         action = torch.cat(actions) if len(actions) > 1 else actions[0]
         if order is not None:
             action = torch.empty_like(action).index_copy_(0, order, action)
@@ -116,16 +115,12 @@ class Worlds:
         return _shaped(mode, "act() actions", action, (n, self.sim.nu)).to(u.dtype)
 
 
-def _groups(modes: Tensor, size: int) -> tuple[Tensor | None, list[tuple[int, slice]]]:
-    """An order of `modes` (n,), of `size` that there are, and the stretch of each mode in it.
+def _groups(modes: Tensor, size: int) -> tuple[Tensor | None, dict[int, int]]:
+    """An order that brings equal ones of `modes` (n,) together, and how many there are of each of `size`.
 
     None for the order where one mode has all.
     """
-    counts = modes.bincount(minlength=size).tolist()
-    ends = list(accumulate(counts))
-    groups = [
-        (index, slice(end - n, end)) for index, (n, end) in enumerate(zip(counts, ends, strict=True)) if n
-    ]
+    groups = {index: n for index, n in enumerate(modes.bincount(minlength=size).tolist()) if n > 0}
     if len(groups) == 1:
         return None, groups
     if modes.device.type == "cpu":  # by counting, which torch does not for so few values
