@@ -8,7 +8,7 @@ import pytest
 
 from hmc.cfg import load
 from hmc.sampling import METHODS
-from tools import cartpole as study
+from tools import cartpole, cartpole_study
 from tools.cartpole_figures import gap, reference
 
 TINY = (
@@ -19,20 +19,24 @@ TINY = (
 
 
 @pytest.fixture(scope="module")
-def cfg() -> study.StudyCfg:
-    return load(study.ROOT / "cfg" / "cartpole.toml", study.StudyCfg, TINY)
+def cfg() -> cartpole_study.StudyCfg:
+    return load(cartpole.ROOT / "cfg" / "cartpole.toml", cartpole_study.StudyCfg, TINY)
 
 
 @pytest.fixture(scope="module")
-def rows(cfg) -> list[study.Row]:
-    return [study.work(cfg, job) for job in study.jobs(cfg)]
+def rows(cfg) -> list[cartpole_study.Row]:
+    return [cartpole_study.work(cfg, job) for job in cartpole_study.jobs(cfg)]
 
 
 def test_every_planner_keeps_to_the_same_budget(cfg, rows):
     for row in rows:
-        budget = cfg.rollouts * row.horizon if row.part == "solve" else 2 * cfg.loop.rollouts * row.horizon
+        budget = (
+            cfg.rollouts * row.job.horizon
+            if row.job.part == "solve"
+            else 2 * cfg.loop.rollouts * row.job.horizon
+        )
         assert row.control_steps <= budget, row
-        if row.planner in METHODS:
+        if row.job.planner in METHODS:
             assert row.control_steps == budget
 
 
@@ -40,10 +44,10 @@ def test_costs_are_those_of_the_task(cfg, rows):
     """No schedule is below what iLQR finds by more than its tolerance, and a gap is a mean step's cost."""
     for row in rows:
         assert math.isfinite(row.cost)
-        if (row.part, row.num_modes) == ("solve", 5):
-            assert gap(rows, row) == pytest.approx((row.cost - reference(rows, row)) / row.horizon)
+        if (row.job.part, row.job.num_modes) == ("solve", 5):
+            assert gap(rows, row) == pytest.approx((row.cost - reference(rows, row.job)) / row.job.horizon)
             assert gap(rows, row) > -1e-3
-    again = study.work(cfg, rows[0].job)
+    again = cartpole_study.work(cfg, rows[0].job)
     assert (again.cost, again.control_steps) == (rows[0].cost, rows[0].control_steps)
 
 
@@ -60,15 +64,15 @@ def test_a_stopped_study_goes_on(cfg, rows, tmp_path, monkeypatch, capsys):
         ran.extend(todo)
         yield from (next(row for row in rows if row.job == job) for job in todo)
 
-    args = study.Args(out=tmp_path, set=TINY)
-    monkeypatch.setattr(study, "run_all", stops)
-    assert study.main(args) == 1
+    args = cartpole.Args(out=tmp_path, set=TINY)
+    monkeypatch.setattr(cartpole, "run_all", stops)
+    assert cartpole.main(args) == 1
     assert "stopped with 3 of" in capsys.readouterr().out
     assert not (tmp_path / "results.csv").exists()
-    monkeypatch.setattr(study, "run_all", ends)
-    assert study.main(args) == 0
-    assert sorted(map(str, ran)) == sorted(map(str, study.jobs(cfg)))
-    assert study.read(tmp_path / "results.csv") == rows
+    monkeypatch.setattr(cartpole, "run_all", ends)
+    assert cartpole.main(args) == 0
+    assert sorted(map(str, ran)) == sorted(map(str, cartpole_study.jobs(cfg)))
+    assert cartpole.read(tmp_path / "results.csv") == rows
     assert {"gap.png", "sequence.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
@@ -80,13 +84,13 @@ def test_other_settings_begin_anew(rows, tmp_path, monkeypatch):
         yield next(row for row in rows if row.job == todo[0])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(study, "run_all", stops)
+    monkeypatch.setattr(cartpole, "run_all", stops)
     for settings in (TINY, TINY, (*TINY, "rollouts=70")):
-        study.main(study.Args(out=tmp_path, set=settings))
+        cartpole.main(cartpole.Args(out=tmp_path, set=settings))
     assert todos == [len(rows), len(rows) - 1, len(rows)]
 
 
 def test_an_unknown_key(capsys):
     with pytest.raises(SystemExit):
-        study.main(study.Args(set=("horizon=[3]",)))
+        cartpole.main(cartpole.Args(set=("horizon=[3]",)))
     assert "unknown key horizon; did you mean horizons?" in capsys.readouterr().err

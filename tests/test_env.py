@@ -242,6 +242,15 @@ def test_a_measurement_takes_each_recorded_state_once(tmp_path):
         evaluate.set_up(replace(args, episodes=6))
 
 
+def test_successes_by_moment():
+    good = torch.tensor([True, False, True, True])
+    found = evaluate.by_moment(good, torch.tensor([13, 20, 20, 13, 7]))  # the last one is of no episode
+    assert {moment: (part.success, part.episodes) for moment, part in found.items()} == {
+        13: (2, 2),
+        20: (1, 2),
+    }
+
+
 def test_recorded_starts_need_their_file(tmp_path):
     with pytest.raises(ValueError, match=r"starts\.recorded > 0 needs starts\.records"):
         Starts(HANDSTAND, StartsCfg(recorded=0.5), CPU)

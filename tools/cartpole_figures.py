@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,40 +11,33 @@ from rich.table import Table
 
 from hmc.ilqr import Optimum
 from hmc.planner import Plan
+from tools.cartpole_study import Job, Row, StudyCfg
 from tools.figures import save
-
-if TYPE_CHECKING:
-    from tools.cartpole import Row, StudyCfg
 
 NAMES = {"schedules": "mode schedules (ours)", "mppi": "MPPI", "cem": "CEM", "ps": "predictive sampling"}
 COLORS = {"schedules": "#d1495b", "mppi": "#30638e", "cem": "#edae49", "ps": "#4c9f70"}
 
 
-def reference(rows: list[Row], like: Row) -> float:
-    """The lowest of iLQR's local optima of a row's horizon and angle."""
-    same = [
-        r.cost for r in rows if r.planner == "ilqr" and (r.horizon, r.angle) == (like.horizon, like.angle)
-    ]
-    return min(same)
+def reference(rows: list[Row], like: Job) -> float:
+    """The lowest of iLQR's local optima of a job's horizon and angle."""
+    same = (like.horizon, like.angle)
+    return min(r.cost for r in rows if r.job.planner == "ilqr" and (r.job.horizon, r.job.angle) == same)
 
 
 def gap(rows: list[Row], row: Row) -> float:
     """(J - J_iLQR) / T, the paper's measure."""
-    return (row.cost - reference(rows, row)) / row.horizon
+    return (row.cost - reference(rows, row.job)) / row.job.horizon
+
+
+def of(rows: list[Row], **settings: object) -> list[Row]:
+    """The rows whose job has these settings."""
+    return [row for row in rows if all(getattr(row.job, name) == each for name, each in settings.items())]
 
 
 def pick(rows: list[Row], cfg: StudyCfg, part: str, planner: str) -> dict[int, list[Row]]:
     """Rows of one planner by horizon, with the study's own number of modes and start angle."""
-    task = cfg.task
-    return {
-        horizon: [
-            row
-            for row in rows
-            if (row.part, row.planner, row.horizon) == (part, planner, horizon)
-            and (row.num_modes, row.angle) == (task.num_modes, task.angle)
-        ]
-        for horizon in sorted(cfg.horizons)
-    }
+    own = {"num_modes": cfg.task.num_modes, "angle": cfg.task.angle}
+    return {t: of(rows, part=part, planner=planner, horizon=t, **own) for t in sorted(cfg.horizons)}
 
 
 def gaps(path: Path, rows: list[Row], cfg: StudyCfg) -> None:
@@ -106,20 +98,11 @@ def table(rows: list[Row], cfg: StudyCfg) -> Table:
             found = [pick(rows, cfg, part, planner)[horizon] for planner in NAMES]
             values = [[gap(rows, r) if part == "solve" else r.cost for r in each] for each in found]
             line(f"{label}, T = {horizon}", values)
-    solved = [row for row in rows if row.part == "solve" and row.horizon == cfg.task.horizon]
+    solved = of(rows, part="solve", horizon=cfg.task.horizon)
     for count in cfg.num_modes:
-        ours = [
-            r for r in solved if (r.planner, r.num_modes, r.angle) == ("schedules", count, cfg.task.angle)
-        ]
+        ours = of(solved, planner="schedules", num_modes=count, angle=cfg.task.angle)
         line(f"gap, {count} modes", [[gap(rows, row) for row in ours]])
     for angle in cfg.angles:
-        cells = [
-            [
-                gap(rows, r)
-                for r in solved
-                if (r.planner, r.angle, r.num_modes) == (planner, angle, cfg.task.num_modes)
-            ]
-            for planner in NAMES
-        ]
-        line(f"gap from {np.degrees(angle):.0f} deg", cells)
+        found = [of(solved, planner=each, angle=angle, num_modes=cfg.task.num_modes) for each in NAMES]
+        line(f"gap from {np.degrees(angle):.0f} deg", [[gap(rows, row) for row in each] for each in found])
     return view

@@ -77,13 +77,27 @@ def reached_and_kept(held: Tensor, reach: int, keep: int) -> Tensor:
 
 
 @torch.no_grad()
-def score(policy: Policy, starts: Starts, protocol: str, episodes: int, threads: int) -> Score:
-    """Successes of `episodes` under one of PROTOCOLS."""
+def succeeded(policy: Policy, starts: Starts, protocol: str, episodes: int, threads: int) -> Tensor:
+    """Which of `episodes` are successes under one of PROTOCOLS, (episodes,) bool."""
     start = starts.sample(episodes)
     sim = MujocoSim(load_model(), episodes, threads=threads)
     reach, keep = (round(seconds / sim.dt) for seconds in PROTOCOLS[protocol])
     held = held_over_time(sim, policy, starts.stance, start.x, start.u, reach + keep)
-    return Score(int(reached_and_kept(held, reach, keep).sum()), episodes)
+    return reached_and_kept(held, reach, keep)
+
+
+def by_moment(good: Tensor, after: Tensor) -> dict[int, Score]:
+    """Scores of recorded starts apart by the control steps since take-off at which they were recorded.
+
+    Args:
+        good: successes, (n,) bool, of the first n records.
+        after: those control steps, one a record.
+    """
+    moments = after[: len(good)]
+    return {
+        moment: Score(int(good[moments == moment].sum()), int((moments == moment).sum()))
+        for moment in moments.unique().tolist()
+    }
 
 
 @dataclass(frozen=True)
@@ -129,9 +143,13 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     with one_line_errors():
         policy, starts = set_up(args)
-    result = score(policy, starts, args.starts, args.episodes, args.threads)
+    good = succeeded(policy, starts, args.starts, args.episodes, args.threads)
+    result = Score(int(good.sum()), args.episodes)
     reach, keep = PROTOCOLS[args.starts]
     print(f"{policy.metadata['mode']} from {args.starts}: within {reach} s and held {keep} s: {result}")
+    if args.starts == "recorded" and starts.records is not None and "after" in starts.records:
+        for moment, part in by_moment(good, starts.records["after"]).items():
+            print(f"  {moment} steps after take-off: {part}")
     if args.json is not None:
         low, high = result.interval
         data = {"success": result.success, "episodes": result.episodes, "low": low, "high": high}
