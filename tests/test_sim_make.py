@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from hmc.go2.model import HOME, load_model
-from hmc.sim.make import find_device, make_sim
+from hmc.sim.device import find_device
+from hmc.sim.make import make_sim
 from hmc.sim.mujoco import MujocoSim
 
 NO_GPU = not torch.cuda.is_available()

@@ -81,7 +81,7 @@ class FlipCfg:
         foot: policy file of the foot stand; empty for the one that comes with the package.
         hand: policy file of the handstand, likewise.
         substeps: physics steps a control step of the planner's model; the robot's own has 4.
-        iterations: of the contact solver in the planner's model, at most.
+        iterations: of the contact solver in the planner's model, at most; None for the robot's own.
         ensemble: other models that schedules are judged on as well.
     """
 
@@ -92,7 +92,7 @@ class FlipCfg:
     foot: str = ""
     hand: str = ""
     substeps: int = go2.SUBSTEPS
-    iterations: int = 20
+    iterations: int | None = None
     ensemble: EnsembleCfg = field(default_factory=EnsembleCfg)
 
 

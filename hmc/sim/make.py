@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from hmc.sim.device import devices, find_device
+
 if TYPE_CHECKING:
     import mujoco
 
@@ -51,9 +53,7 @@ def make_sim(
 
         return MujocoSim(model, num_worlds, substeps=substeps, threads=threads)
     if there is None and not torch.cuda.is_available():
-        raise ValueError(
-            f"engine warp wants a GPU and {_devices()}: take engine mujoco, its fast CPU sibling"
-        )
+        raise ValueError(f"engine warp wants a GPU and {devices()}: take engine mujoco, its fast CPU sibling")
     try:
         from hmc.sim.warp import WarpSim
     except ModuleNotFoundError as error:
@@ -61,29 +61,3 @@ def make_sim(
             f"engine warp needs {error.name}: pip install 'hmc[warp]', or take mujoco"
         ) from error
     return WarpSim(model, num_worlds, device=there or "cuda", substeps=substeps)
-
-
-def find_device(device: str | torch.device) -> torch.device:
-    """The torch device of a name, with its index; an error if this machine has no such device."""
-    try:
-        found = torch.device(device)
-    except RuntimeError:
-        raise ValueError(f"unknown device {str(device)!r}: name one like cpu or cuda:0") from None
-    if found.type == "cpu":
-        return torch.device("cpu")
-    if found.type != "cuda":
-        raise ValueError(f"engines run on cpu or cuda devices, not on {device}")
-    index = found.index or 0
-    if index >= torch.cuda.device_count():
-        raise ValueError(f"device {device} does not exist, {_devices()}: take one of these")
-    return torch.device("cuda", index)
-
-
-def _devices() -> str:
-    """What there is, in words."""
-    count = torch.cuda.device_count()
-    if count:
-        return "there are cpu, " + ", ".join(f"cuda:{i}" for i in range(count))
-    if torch.version.cuda is None:
-        return "there is only cpu (this torch is built without CUDA)"
-    return "there is only cpu (no GPU, or no NVIDIA driver)"

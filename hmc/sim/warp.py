@@ -12,8 +12,8 @@ import warp as wp
 from torch import Tensor
 
 from hmc.sim.check import check
+from hmc.sim.device import find_device
 from hmc.sim.ids import Ids, count, fresh, where
-from hmc.sim.make import find_device
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # not one line a compiled kernel
 

@@ -1,0 +1,31 @@
+"""Devices by name, with an error in one line for one that is not there."""
+
+from __future__ import annotations
+
+import torch
+
+
+def find_device(device: str | torch.device) -> torch.device:
+    """The torch device of a name, with its index; an error if this machine has no such device."""
+    try:
+        found = torch.device(device)
+    except RuntimeError:
+        raise ValueError(f"unknown device {str(device)!r}: name one like cpu or cuda:0") from None
+    if found.type == "cpu":
+        return torch.device("cpu")
+    if found.type != "cuda":
+        raise ValueError(f"engines run on cpu or cuda devices, not on {device}")
+    index = found.index or 0
+    if index >= torch.cuda.device_count():
+        raise ValueError(f"device {device} does not exist, {devices()}: take one of these")
+    return torch.device("cuda", index)
+
+
+def devices() -> str:
+    """What there is, in words."""
+    count = torch.cuda.device_count()
+    if count:
+        return "there are cpu, " + ", ".join(f"cuda:{i}" for i in range(count))
+    if torch.version.cuda is None:
+        return "there is only cpu (this torch is built without CUDA)"
+    return "there is only cpu (no GPU, or no NVIDIA driver)"
