@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -203,7 +204,7 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
         seed: of the jump's noise and of the ensemble.
         threads: of the engine and the policies; 0 for all cores.
     """
-    coarse = {"substeps": cfg.substeps, "iterations": cfg.iterations, "threads": threads}
+    coarse: dict[str, Any] = {"substeps": cfg.substeps, "iterations": cfg.iterations, "threads": threads}
     sim = partial(make_sim, **coarse)
     modes = ModeSet(
         [
