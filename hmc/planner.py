@@ -143,6 +143,7 @@ def plan(
     schedule: Sequence[int | str] | None = None,
     solver: str = "sample",
     samples: int = 64,
+    max_samples: int = 0,
     order: str = "uniform",
     pairs: int = 0,
     iterations: int | None = None,
@@ -174,6 +175,8 @@ def plan(
         solver: "sample" (Algorithms 1 and 2) takes the best of the first batch that improves; "exhaustive"
             (Algorithm 1) evaluates all of Omega and takes the best.
         samples: N, switches drawn a batch.
+        max_samples: batches double up to this size while nothing improves, since many at once are cheaper
+            each; 0 for N throughout.
         order: of "sample"'s draws: "uniform", as Theorem 2 has it, or "tails": the switches that last to
             the end of the horizon first. Either way each switch comes once.
         pairs: further draws that "sample" makes beside each batch, of two switches stitched at once (see
@@ -194,9 +197,8 @@ def plan(
     """
     _known("solver", solver, SOLVERS)
     _known("order", order, ORDERS)
-    _check(samples, pairs, iterations, tolerance)
-    size = len(SwitchSpace(len(task.modes), task.horizon))
-    sim = sim if sim is not None else task.make_sim(min(samples, size))
+    _check(samples, max_samples, pairs, iterations, tolerance)
+    sim = sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs))
     if forget:
         for each in task.modes:
             each.forget()
@@ -214,7 +216,15 @@ def plan(
         stay = Schedule.constant(start.mode, task.horizon, task.modes.names)
         incumbent = stay if math.isfinite(meter.evaluator.follow(stay)) else incumbent
     search = Search(
-        meter.evaluator, meter, incumbent, samples, tolerance, np.random.default_rng(seed), order, pairs
+        meter.evaluator,
+        meter,
+        incumbent,
+        samples,
+        tolerance,
+        np.random.default_rng(seed),
+        order,
+        pairs,
+        max_samples,
     )
     if progress is not None:
         search.report = lambda search: progress(_plan(search, incumbent))
@@ -225,6 +235,11 @@ def plan(
         search.stopped_by = "interrupt"
         raise PlanInterrupted(_plan(search, incumbent)) from None
     return _plan(search, incumbent)
+
+
+def worlds_for(task: Task, samples: int, max_samples: int, pairs: int) -> int:
+    """Worlds that a batch fits into, with one more for the schedule that is recorded beside it."""
+    return min(max(samples, max_samples, pairs), len(SwitchSpace(len(task.modes), task.horizon))) + 1
 
 
 def _incumbent(
@@ -276,9 +291,11 @@ def _known(what: str, name: str, names: Mapping[str, object]) -> None:
         raise ValueError(f"unknown {what} {name!r}: expected one of {', '.join(names)}{hint}")
 
 
-def _check(samples: int, pairs: int, iterations: int | None, tolerance: float) -> None:
+def _check(samples: int, max_samples: int, pairs: int, iterations: int | None, tolerance: float) -> None:
     if samples < 1:
         raise ValueError(f"samples must be at least 1 switch a batch, got {samples}")
+    if max_samples < 0:
+        raise ValueError(f"max_samples must be >= 0 switches a batch, got {max_samples}")
     if pairs < 0:
         raise ValueError(f"pairs must be >= 0 draws beside each batch, got {pairs}")
     if iterations is not None and iterations < 0:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hmc.budget import Budget
-from hmc.planner import Plan, Progress, plan
+from hmc.planner import Plan, Progress, plan, worlds_for
 from hmc.sim.base import Sim
 from hmc.start import Vector, make_start
 from hmc.task import Task
@@ -53,7 +53,8 @@ class Receding:
         seed: of the draws; each tick draws from (seed, k).
         k: control step of the first tick.
         sim: simulator to plan in; made once if left out.
-        solver, samples, order, pairs, iterations, budget, tolerance, progress: as in `plan`, for every tick.
+        solver, samples, max_samples, order, pairs, iterations, budget, tolerance, progress: as in `plan`, for
+            every tick.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class Receding:
         sim: Sim | None = None,
         solver: str = "sample",
         samples: int = 64,
+        max_samples: int = 0,
         order: str = "uniform",
         pairs: int = 0,
         iterations: int | None = None,
@@ -74,7 +76,7 @@ class Receding:
         progress: Progress | None = None,
     ):
         self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
-        self.sim = sim if sim is not None else task.make_sim(samples)
+        self.sim = sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs))
         self.mode: int | None = None
         self.ran: int | None = None
         self.memory: Tensor | None = None
@@ -86,6 +88,7 @@ class Receding:
             sim=self.sim,
             solver=solver,
             samples=samples,
+            max_samples=max_samples,
             order=order,
             pairs=pairs,
             iterations=iterations,

@@ -28,6 +28,7 @@ class Search:
         rng: where draws come from.
         order: of the draws, one of ORDERS.
         pairs: draws beside each batch that stitch two switches at once.
+        most: size that batches double to while nothing improves; none beyond N if smaller.
         report: told after every batch and accepted switch; False ends the search.
         costs: the incumbent's cost, then the cost after each accepted switch or pair.
         switches: accepted switches.
@@ -43,6 +44,7 @@ class Search:
     rng: np.random.Generator
     order: str = "uniform"
     pairs: int = 0
+    most: int = 0
     report: Callable[[Search], bool | None] = lambda _: None
     costs: list[float] = field(default_factory=list)
     switches: list[Switch] = field(default_factory=list)
@@ -68,11 +70,11 @@ class Search:
         return self._found is not None
 
     def batches(self, order: Draws | TailsFirst | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
-        """Switches of Omega in an order, N at a time: indices and costs, (n,) each; inf if not known."""
-        waiting = torch.empty(0, dtype=torch.long)
+        """Switches of Omega in an order, batch by batch: indices and costs, (n,) each; inf if not known."""
+        waiting, size = torch.empty(0, dtype=torch.long), self.samples
         self.evaluator.follow(self.schedule)
         while order.left > 0 or len(waiting) > 0:
-            waiting = torch.cat([waiting, order.take(self.samples - len(waiting))])
+            waiting = torch.cat([waiting, order.take(size - len(waiting))])
             room, limit = self.meter.room(len(waiting))
             schedules = self.space.stitch(self.schedule, waiting[:room])
             if room > 0 and (n := self.meter.affordable(schedules)) < room:
@@ -88,6 +90,7 @@ class Search:
             if self.stopped_by or not known.all():
                 self.stopped_by = self.stopped_by or "seconds"
                 return
+            size = max(self.samples, min(2 * size, self.most))
             self.tell()
 
     def offer(self, switches: Sequence[Switch], cost: float) -> None:

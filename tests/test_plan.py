@@ -154,6 +154,34 @@ def test_a_budget_that_reaches_all_of_omega_converges():
     assert (again.stopped_by, again.draws, again.coverage) == ("converged", 30, 1.0)
 
 
+@pytest.mark.parametrize(("most", "sizes"), [(0, [4] * 15 + [3]), (16, [4, 8, 16, 16, 16, 3])])
+def test_batches_double_while_nothing_improves(most, sizes):
+    """With an incumbent that nothing improves: all of Omega, each switch once."""
+    best, seen = plan(toy_task(6), FAR).schedule, [0]
+    result = plan(
+        toy_task(6), FAR, schedule=best, samples=4, max_samples=most, progress=lambda p: seen.append(p.draws)
+    )
+    assert [after - before for before, after in pairwise(seen)] == sizes
+    assert result.locally_optimal
+
+
+def test_batches_begin_small_again_after_a_switch():
+    notes = []
+    plan(
+        toy_task(8),
+        FAR,
+        samples=2,
+        max_samples=64,
+        progress=lambda p: notes.append((len(p.switches), p.draws)),
+    )
+    first: dict[int, int] = {}  # draws of the first batch after each accepted switch
+    for (before, drawn), (after, now) in pairwise(notes):
+        if before == after:
+            first.setdefault(after, now - drawn)
+    assert len(first) > 1
+    assert set(first.values()) == {2}
+
+
 def test_coverage_counts_since_the_last_accepted_switch():
     best = plan(toy_task(6), FAR).schedule
     result = plan(toy_task(6), FAR, schedule=best, samples=10, budget=Budget(draws=21))
@@ -285,6 +313,7 @@ BAD = {
         "unknown order 'tail': expected one of uniform, tails; did",
     ),
     "no samples": ({"samples": 0}, ValueError, "samples must be at least 1"),
+    "a negative largest batch": ({"max_samples": -1}, ValueError, "max_samples must be >= 0"),
     "fewer pairs than none": ({"pairs": -1}, ValueError, "pairs must be >= 0"),
     "iterations": ({"iterations": -1}, ValueError, "iterations must be >= 0"),
     "tolerance": ({"tolerance": math.nan}, ValueError, "tolerance must be a finite share"),
