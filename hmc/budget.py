@@ -17,7 +17,8 @@ class Budget:
 
     The incumbent is always rolled out, whatever the budget. Beyond that, draws are never exceeded, nor
     are control steps where modes make none of their own. What a sampling mode will roll out inside
-    itself is not known before; it is reckoned by what the rollouts before took. A wall-clock budget is
+    itself is not known before; it is reckoned by what the rollouts before took. Control steps that suffice
+    for less than a quarter of the largest batch so far are left unspent. A wall-clock budget is
     looked at before every control step; a batch that it cuts short is dropped, and the result may then
     depend on the machine's speed.
 

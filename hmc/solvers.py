@@ -51,6 +51,7 @@ class Search:
     seen: int = 0
     stopped_by: str | None = None
     _found: tuple[tuple[Switch, ...], float] | None = None
+    _largest: int = 0
 
     def __post_init__(self) -> None:
         self.space = SwitchSpace(len(self.evaluator.task.modes), len(self.schedule))
@@ -78,11 +79,12 @@ class Search:
             room, limit = self.meter.room(len(waiting))
             schedules = self.space.stitch(self.schedule, waiting[:room])
             if room > 0 and (n := self.meter.affordable(schedules)) < room:
-                room, limit = n, "control_steps"
+                # few rollouts take as long as many: what is left over is not worth another round
+                room, limit = n if 4 * n >= self._largest else 0, "control_steps"
             if room <= 0:
                 self.stopped_by = limit
                 return
-            indices, waiting = waiting[:room], waiting[room:]
+            indices, waiting, self._largest = waiting[:room], waiting[room:], max(self._largest, room)
             costs = self._roll(schedules[:room])
             known = ~costs.isnan()
             self.seen += int(known.sum())

@@ -46,6 +46,7 @@ class SchedulesCfg:
     """The search over mode schedules, see `hmc.plan`."""
 
     samples: int = 64
+    max_samples: int = 0
     order: str = "uniform"
     pairs: int = 0
 
@@ -67,7 +68,8 @@ class StudyCfg:
         horizons: T, in control steps.
         seeds: of each planner.
         rollouts: budget of one solution: this many times T control steps.
-        starts: random inputs that iLQR begins from, for each seed.
+        optima: iLQR's runs, with a seed each; the best of all is the reference.
+        starts: random inputs that each of them begins from.
         num_modes: numbers of modes to compare, at the task's horizon.
         angles: start angles to compare, likewise [rad].
         task: the cartpole.
@@ -75,10 +77,11 @@ class StudyCfg:
         schedules, mppi, cem, ps: the planners.
     """
 
-    horizons: tuple[int, ...] = (20, 50, 100)
+    horizons: tuple[int, ...] = (20, 35, 50, 75, 100, 150)
     seeds: int = 5
     rollouts: int = 1000
-    starts: int = 3
+    optima: int = 2
+    starts: int = 1
     num_modes: tuple[int, ...] = (3, 5, 9, 17)
     angles: tuple[float, ...] = (math.pi, math.pi / 2)
     task: CartpoleCfg = field(default_factory=CartpoleCfg)
@@ -128,14 +131,14 @@ def jobs(cfg: StudyCfg) -> list[Job]:
         for horizon in sorted(cfg.horizons, reverse=True)
         for part, planners in (("loop", PLANNERS), ("solve", (*PLANNERS, "ilqr")))
         for planner in planners
-        for seed in seeds
+        for seed in (range(cfg.optima) if planner == "ilqr" else seeds)
     ]
     found += [Job("solve", "schedules", cfg.task.horizon, s, m, angle) for m in cfg.num_modes for s in seeds]
     found += [
         Job("solve", planner, cfg.task.horizon, seed, modes, angle)
         for angle in cfg.angles
         for planner in (*PLANNERS, "ilqr")
-        for seed in seeds
+        for seed in (range(cfg.optima) if planner == "ilqr" else seeds)
     ]
     return list(dict.fromkeys(found))
 

@@ -14,7 +14,7 @@ from hmc.go2.observe import OBS_SIZE
 from hmc.go2.policy import contract
 from hmc.go2.stances import HANDSTAND
 
-HIDDEN = (512, 256, 128)
+HIDDEN = (256, 128, 64)
 
 
 def write_random_policy(path: Path, hidden: tuple[int, ...] = HIDDEN, seed: int = 0) -> Path:

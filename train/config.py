@@ -47,7 +47,7 @@ class PpoCfg:
     entropy: float = 0.005
     clip: float = 0.2
     init_std: float = 0.35
-    hidden: tuple[int, ...] = (512, 256, 128)
+    hidden: tuple[int, ...] = (256, 128, 64)
 
 
 @dataclass(frozen=True)
