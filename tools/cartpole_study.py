@@ -77,7 +77,7 @@ class StudyCfg:
         schedules, mppi, cem, ps: the planners.
     """
 
-    horizons: tuple[int, ...] = (20, 35, 50, 75, 100, 150)
+    horizons: tuple[int, ...] = (20, 40, 70, 100, 150)
     seeds: int = 5
     rollouts: int = 1000
     optima: int = 2
