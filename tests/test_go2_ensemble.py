@@ -9,7 +9,7 @@ import torch
 
 from hmc import Budget, plan
 from hmc.go2.ensemble import EnsembleCfg, make_ensemble, perturbed_model
-from hmc.go2.model import load_model
+from hmc.go2.model import load_model, motor_torque
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import FlipCfg, flip_task
 from tools.random_policy import write_random_policy
@@ -44,6 +44,20 @@ def test_friction_of_the_feet_on_the_floor(friction):
     mujoco.mj_forward(model, data)
     assert data.ncon == 4
     assert {contact.friction[0] for contact in data.contact} == {friction}
+
+
+@pytest.mark.parametrize("strength", [0.9, 1.1])
+def test_motors_give_so_many_times_the_torque(strength):
+    """Anywhere on the torque-speed curve: driving, braking, saturated."""
+    model, rng = perturbed_model(strength=strength), np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    for _ in range(200):
+        q, qd = rng.uniform(-1, 1, 12), rng.uniform(-28, 28, 12)
+        target = q + rng.uniform(-1, 1, 12)
+        data.qpos[:7], data.qpos[7:], data.qvel[6:], data.ctrl[:] = [0, 0, 5, 1, 0, 0, 0], q, qd, target
+        mujoco.mj_forward(model, data)
+        nominal = motor_torque(*(torch.tensor(each) for each in (q, qd, target))).numpy()
+        np.testing.assert_allclose(data.actuator_force, strength * nominal, atol=1e-4)
 
 
 def test_members_differ_and_are_the_same_for_a_seed():
@@ -85,3 +99,5 @@ def test_bad_values():
         EnsembleCfg(members=-1)
     with pytest.raises(ValueError, match=r"ensemble\.friction must be \(lowest, highest\), got 1\.0, 0\.5"):
         EnsembleCfg(friction=(1.0, 0.5))
+    with pytest.raises(ValueError, match=r"ensemble\.latency must be within 0 and a control step of 0\.02 s"):
+        EnsembleCfg(latency=(0.0, 0.03))

@@ -223,6 +223,25 @@ def test_a_rollout_is_its_steps(sim):
     assert torch.equal(sim.save(), reached)
 
 
+@pytest.mark.parametrize("latency", [0, 1, 3, 4])
+def test_inputs_come_late(latency):
+    """As many physics steps, each by itself, with the inputs of a control step shifted by the latency."""
+    late = MujocoSim(load_model(), W, threads=1, latency=latency)
+    single = MujocoSim(load_model(), W, substeps=1, threads=1)
+    u = 4 * inputs(late, 6) - 3 * rest(late)
+    for sim in (late, single):
+        restart(sim)
+    held = torch.cat([rest(late)[None].expand(latency, -1, -1), u.repeat_interleave(4, 0)])[:24]
+    reached = run(single, held)[3::4]
+    assert torch.equal(run(late, u), reached)
+    assert torch.equal(late.u(), u[-1]), "what was asked for last"
+    after = late.save()
+    restart(late)
+    ids = index(late, 3, 0, 4)
+    assert torch.equal(rollout(late, u[:, ids].transpose(0, 1), ids).transpose(0, 1), reached[:, ids])
+    assert torch.equal(late.save(ids), after[ids])
+
+
 def test_a_rollout_that_is_given_up_is_not_a_number():
     """The engine stops a world that moves too fast, whose state is finite still."""
     sim = made("mujoco-1")

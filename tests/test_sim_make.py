@@ -73,6 +73,8 @@ def test_sizes(model):
         make_sim(model, 1, "mujoco", substeps=0)
     with pytest.raises(ValueError, match="num_worlds must be at least 1, got 0"):
         make_sim(model, 0, "warp", device="cpu")
+    with pytest.raises(ValueError, match="latency must be 0 to 4 physics steps, a control step, got 5"):
+        MujocoSim(model, 1, latency=5)
     with pytest.raises(ValueError, match="substeps must be at least 1, got 0"):
         make_sim(model, 1, "warp", device="cpu", substeps=0)
 

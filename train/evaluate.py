@@ -87,7 +87,7 @@ def succeeded(policy: Policy, starts: Starts, protocol: str, episodes: int, thre
 
 
 def by_moment(good: Tensor, after: Tensor) -> dict[int, Score]:
-    """Scores of recorded starts apart by the control steps since take-off at which they were recorded.
+    """Scores of recorded starts apart by the control steps of the jump after which they were recorded.
 
     Args:
         good: successes, (n,) bool, of the first n records.
@@ -149,7 +149,7 @@ def main(args: Args) -> None:
     print(f"{policy.metadata['mode']} from {args.starts}: within {reach} s and held {keep} s: {result}")
     if args.starts == "recorded" and starts.records is not None and "after" in starts.records:
         for moment, part in by_moment(good, starts.records["after"]).items():
-            print(f"  {moment} steps after take-off: {part}")
+            print(f"  after {moment} steps of the jump: {part}")
     if args.json is not None:
         low, high = result.interval
         data = {"success": result.success, "episodes": result.episodes, "low": low, "high": high}

@@ -23,13 +23,18 @@ class MujocoSim:
         num_worlds: number of worlds W.
         substeps: physics steps a control step.
         threads: threads that step worlds, the caller's included; 0 for all cores.
+        latency: physics steps of a control step in which the input before it still acts.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_worlds: int, *, substeps: int = 4, threads: int = 0):
+    def __init__(
+        self, model: mujoco.MjModel, num_worlds: int, *, substeps: int = 4, threads: int = 0, latency: int = 0
+    ):
         if num_worlds < 1:
             raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, got {substeps}")
+        if not 0 <= latency <= substeps:
+            raise ValueError(f"latency must be 0 to {substeps} physics steps, a control step, got {latency}")
         if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET:
             raise ValueError(
                 "the model resets diverged worlds by itself, which would hide them from the planner: "
@@ -39,7 +44,7 @@ class MujocoSim:
         mujoco.set_mju_user_warning(_quiet)
         self.model = model
         self.batch = Batch(model, num_worlds, threads)
-        self._substeps = substeps
+        self._substeps, self._latency = substeps, latency
         self._row = torch.from_numpy(self.batch.state)
         self._qpos = torch.from_numpy(self.batch.bind("qpos"))
         self._qvel = torch.from_numpy(self.batch.bind("qvel"))
@@ -88,23 +93,31 @@ class MujocoSim:
 
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
-        self._ctrl[where(ids)] = u.to(torch.float64)
-        if isinstance(ids, slice):
-            ids = self._all[ids]
+        index = self._all[ids] if isinstance(ids, slice) else ids
         # the engine takes indices in ascending order only
-        self.batch.step(None if ids is None else ids.sort().values.numpy(), nstep=self._substeps)
+        order = None if index is None else index.sort().values.numpy()
+        if self._latency > 0:
+            self.batch.step(order, nstep=self._latency)
+        self._ctrl[where(ids)] = u.to(torch.float64)
+        if self._latency < self._substeps:
+            self.batch.step(order, nstep=self._substeps - self._latency)
 
     def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
         """States after each control step under given inputs, as `hmc.sim.base.rollout`, in one call."""
         check(self.num_worlds, ids, controls=(controls[:, 0], self.nu))
         order = ids.argsort()  # the engine takes indices in ascending order only
         held = controls[order].repeat_interleave(self._substeps, 1).to(torch.float64)
-        steps = held.shape[1]
+        steps, late = held.shape[1], self._latency
+        if late > 0:
+            before = self._ctrl[ids[order]][:, None].expand(-1, late, -1)
+            held = torch.cat([before, held[:, : steps - late]], 1)
         found = self.batch.rollout(steps, held.numpy(), record=("qpos", "qvel"), ids=ids[order].numpy())
         x = torch.cat([torch.from_numpy(found[part]) for part in ("qpos", "qvel")], 2)
         # a world that the engine gave up repeats its last state, although it moves there
         stuck = (x[:, 1:] == x[:, :-1]).all(2) & (x[:, 1:, self.model.nq :] != 0).any(2)
         x[:, 1:][stuck] = torch.nan
+        if late > 0:
+            self._ctrl[ids] = controls[:, -1].to(torch.float64)
         return x[order.argsort(), self._substeps - 1 :: self._substeps]
 
     def save(self, ids: Ids = None) -> Tensor:
