@@ -36,6 +36,7 @@ class Planner(Common):
         horizon: of the system that costs nothing and of the Go2's search of all of Omega, control steps.
         cartpole_horizon: of the cartpole.
         samples: switches a batch of the cartpole's converged plan.
+        max_samples: that they may double to.
         repeats: of what is fast.
         ticks: of the Go2's closed loop, from shortly before the command to flip on.
         set: overrides of cfg/flip.toml.
@@ -43,7 +44,8 @@ class Planner(Common):
 
     horizon: int = 50
     cartpole_horizon: int = 100
-    samples: int = 16384
+    samples: int = 4096
+    max_samples: int = 16384
     repeats: int = 5
     ticks: int = 20
     set: tuple[str, ...] = ()
@@ -56,8 +58,8 @@ def planner(args: Planner) -> Figures:
     modes = ModeSet([ConstantInput(str(i), float(i)) for i in range(3)])
     zero = Cost({"nothing": lambda x, u, u_prev, k: x[:, 0]}, nonnegative=True)
     still = Task("still", modes, zero, args.horizon, NullSim)
-    sim = NullSim(len(SwitchSpace(3, args.horizon)))
-    size = sim.num_worlds
+    size = len(SwitchSpace(3, args.horizon))
+    sim = NullSim(size + 1)
     found = [plan(still, [0.0], solver="exhaustive", samples=size, sim=sim) for _ in range(args.repeats)]
     figures.add(
         "us_per_candidate",
@@ -85,7 +87,7 @@ def _cartpole(figures: Figures, args: Planner) -> None:
     task, x, idle = cartpole(cfg), initial_state(cfg), [cfg.num_modes // 2] * cfg.horizon
     what = f"cartpole, T {cfg.horizon}, M {cfg.num_modes}"
     size = len(SwitchSpace(cfg.num_modes, cfg.horizon))
-    sim = task.make_sim(size)
+    sim = task.make_sim(size + 1)
     exact = [
         plan(task, x, schedule=idle, solver="exhaustive", samples=size, iterations=1, sim=sim)
         for _ in range(args.repeats)
@@ -93,14 +95,14 @@ def _cartpole(figures: Figures, args: Planner) -> None:
     figures.add(
         "cartpole_exact_ms",
         1e3 * statistics.median(p.elapsed for p in exact),
-        f"the best of all {size:,} switches [ms]; {what}",
+        f"the best of all {size:,} switches, {exact[0].control_steps:,} control steps [ms]; {what}",
     )
-    sim = task.make_sim(args.samples)
-    converged = plan(task, x, schedule=idle, samples=args.samples, sim=sim)
+    converged = plan(task, x, schedule=idle, samples=args.samples, max_samples=args.max_samples)
     figures.add(
         "cartpole_converged_ms",
         1e3 * converged.elapsed,
-        f"a locally optimal plan [ms], {len(converged.switches)} switches, {converged.draws:,} draws; {what}",
+        f"a locally optimal plan of cost {converged.cost:.4g} [ms], {len(converged.switches)} switches, "
+        f"{converged.draws:,} draws, {converged.control_steps:,} control steps; {what}",
     )
 
 
