@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from hmc.budget import Budget, Meter
@@ -130,6 +132,21 @@ class PlanInterrupted(KeyboardInterrupt):
         self.plan = plan
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch on one thread: operations on a few thousand worlds are too small to share.
+
+    Two threads gain nothing then, and where a core is busy each of the many operations waits for it.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@_one_thread()
 def plan(
     task: Task,
     x: Vector | Start,
@@ -158,7 +175,8 @@ def plan(
     """Search the mode schedules of `task` from state x, from an incumbent towards lower cost.
 
     The result is never worse than the incumbent. With the same arguments it is the same, whatever the
-    number of worlds or threads, unless the clock, `progress` or Ctrl-C ended the search.
+    number of worlds or threads, unless the clock, `progress` or Ctrl-C ended the search. Torch works on one
+    thread meanwhile; engines and policies have threads of their own.
 
     Args:
         task: modes, cost, horizon T and simulator.

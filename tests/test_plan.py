@@ -147,6 +147,29 @@ def test_control_steps_inside_modes_count():
     assert 6 * limited.rollouts < limited.control_steps
 
 
+def test_torch_has_its_threads_back():
+    seen = set()
+
+    class Watch(Damp):
+        def act(self, x, u, memory, k):
+            seen.add(torch.get_num_threads())
+            if len(x) > 6:
+                raise RuntimeError("out of the search")
+            return super().act(x, u, memory, k)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        plan(toy_task(6, [Push(1.0), Watch()]), FAR, samples=2, iterations=1)
+        assert torch.get_num_threads() == 3
+        with pytest.raises(RuntimeError, match="out of the search"):
+            plan(toy_task(6, [Push(1.0), Watch()]), FAR, samples=64)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert seen == {1}
+
+
 def test_a_budget_that_reaches_all_of_omega_converges():
     task = toy_task(4)
     best = plan(task, FAR)
