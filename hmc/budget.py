@@ -73,6 +73,16 @@ class Meter:
         """
         if self.budget.control_steps is None:
             return len(schedules)
-        left = self.budget.control_steps - self.evaluator.control_steps
-        needed = self.evaluator.needs(schedules) * self.evaluator.control_steps / self.evaluator.own_steps
-        return int(np.searchsorted(needed, left, side="right"))
+        needed = self.evaluator.needs(schedules) * self._nested
+        return int(np.searchsorted(needed, self.budget.control_steps - self.evaluator.control_steps, "right"))
+
+    def settle(self) -> None:
+        """Record the schedule followed last if there is room for that: a next search goes on from it."""
+        steps, limit = self.evaluator.pending * self._nested, self.budget.control_steps
+        if not self.expired() and (limit is None or self.evaluator.control_steps + steps <= limit):
+            self.evaluator.record()
+
+    @property
+    def _nested(self) -> float:
+        """Control steps over those that were not made inside a mode, so far."""
+        return self.evaluator.control_steps / max(1, self.evaluator.own_steps)

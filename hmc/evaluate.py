@@ -66,9 +66,16 @@ class Evaluator:
 
     @property
     def trunk(self) -> Trace:
-        """The trace of the schedule followed last."""
-        self._record()
+        """The trace of the schedule recorded last."""
         return self._trunk
+
+    @property
+    def pending(self) -> int:
+        """Control steps, modes' own aside, that it takes to record what is followed; 0 if it is recorded."""
+        if self._next is None:
+            return 0
+        lead = self._trunk.modes[: len(self._trunk)]
+        return int(added_steps(self._next.tensor()[None], lead)[1][0])
 
     @torch.no_grad()
     def costs(
@@ -101,9 +108,10 @@ class Evaluator:
             fresh, rows = [fresh[i] for i in order], rows[order]
         first = 0
         while first < len(fresh):
-            size = self.sim.num_worlds - (self._next is not None)
+            beside = self._beside
+            size = self.sim.num_worlds - len(beside)
             chunk = slice(first, first + size)
-            modes = None if self._next is None else self._next.modes
+            modes = beside[0].modes if beside else None
             rolled = roll(self._worlds, self._trunk, schedules[rows[chunk]], bound, stop, modes)
             if rolled is None:
                 break
@@ -119,13 +127,15 @@ class Evaluator:
         Fewer if some are pruned or barred.
         """
         new = self._table.missing(self._table.find(self._table.keys(schedules)), math.inf)
+        if self.task.rules is not None:
+            new &= ~self._broken(schedules).cpu().numpy()
         wanted, horizon = schedules[torch.from_numpy(new)].cpu(), self.task.horizon
-        ahead = () if self._next is None else (self._next.tensor()[None].to(wanted.dtype),)
+        ahead = [schedule.tensor()[None].to(wanted.dtype) for schedule in self._beside]
         shared, alone = added_steps(torch.cat([*ahead, wanted]), self._trunk.modes[: len(self._trunk)])
         # a part that does not fit into the simulator with those before it rolls one beginning out again
         parts = np.arange(len(shared)) // max(1, self.sim.num_worlds - len(ahead))
         steps = shared.cumsum() + parts * horizon
-        if self._next is None:
+        if not ahead:
             steps = np.minimum(steps, alone.cumsum())
         return np.concatenate([[0], steps])[len(ahead) + new.cumsum()]
 
@@ -143,19 +153,24 @@ class Evaluator:
         if known:
             cost = float(self._table.costs(found, math.inf)[0])
             self._next = schedule if math.isfinite(cost) and schedule.modes != self._trunk.modes else None
-            if self.sim.num_worlds == 1:  # there is no room beside others
-                self._record()
             return cost
         if found[0] < 0 and not self._allowed(key, torch.tensor([0]), rows)[0]:
             return math.inf
         self._next = schedule
-        trunk = self.trunk
+        self.record()
+        trunk = self._trunk
         self.rollouts += 1
         self.ruled_out += trunk.barred
         self.diverged += not (math.isfinite(trunk.cost) or trunk.barred)
         terms = trunk.terms.cpu().numpy()
         self._table.learn(key, np.array([trunk.cost]), np.array([False]), terms[None])
         return trunk.cost
+
+    @torch.no_grad()
+    def record(self) -> None:
+        """Record the schedule followed last now, if it is not yet."""
+        if self._next is not None:
+            self._trunk, self._next = record(self._worlds, self._trunk, self._next), None
 
     def cost(self, schedule: Schedule) -> float:
         """Cost of one schedule."""
@@ -172,16 +187,22 @@ class Evaluator:
         """The trajectory of one schedule; its control steps are not counted."""
         return record(Worlds(self.task, self.sim), self._trunk, schedule)
 
-    def _record(self) -> None:
-        if self._next is not None:
-            self._trunk, self._next = record(self._worlds, self._trunk, self._next), None
+    @property
+    def _beside(self) -> list[Schedule]:
+        """What the next batch is to record, if it has room for it."""
+        return [self._next] if self._next is not None and self.sim.num_worlds > 1 else []
+
+    def _broken(self, schedules: Tensor) -> Tensor:
+        """Which of schedules (N, T) break the task's rules, (N,) bool."""
+        assert self.task.rules is not None
+        return self.task.rules.broken(self.task.modes, schedules, self.start.mode, self.start.ran)
 
     def _allowed(self, keys: list[bytes], rows: Tensor, schedules: Tensor) -> tuple[list[bytes], Tensor]:
         """The keys and rows of schedules that break no rule; what breaks one is known to cost inf."""
         rules = self.task.rules
         if rules is None or not keys:
             return keys, rows
-        broken = rules.broken(self.task.modes, schedules[rows], self.start.mode, self.start.ran)
+        broken = self._broken(schedules[rows])
         out = [keys[i] for i in broken.nonzero().squeeze(1).tolist()]
         nothing = np.full((len(out), len(self.task.cost.names)), math.nan)
         self._table.learn(out, np.full(len(out), math.inf), np.zeros(len(out), dtype=bool), nothing)

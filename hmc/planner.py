@@ -175,8 +175,9 @@ def plan(
     """Search the mode schedules of `task` from state x, from an incumbent towards lower cost.
 
     The result is never worse than the incumbent. With the same arguments it is the same, whatever the
-    number of worlds or threads, unless the clock, `progress` or Ctrl-C ended the search. Torch works on one
-    thread meanwhile; engines and policies have threads of their own.
+    number of worlds or threads, unless the clock, `progress` or Ctrl-C ended the search; but a budget of
+    control steps reaches less far in a simulator that a batch does not fit into. Torch works on one thread
+    meanwhile; engines and policies have threads of their own.
 
     Args:
         task: modes, cost, horizon T and simulator.
@@ -252,6 +253,8 @@ def plan(
         search.accept()
         search.stopped_by = "interrupt"
         raise PlanInterrupted(_plan(search, incumbent)) from None
+    search.evaluator.follow(search.schedule)
+    meter.settle()
     return _plan(search, incumbent)
 
 

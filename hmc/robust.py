@@ -85,6 +85,16 @@ class EnsembleEvaluator:
         known = ~costs.isnan().any(0)
         return torch.where(known, self.ensemble.risk(costs.nan_to_num(0.0, posinf=math.inf)), math.nan)
 
+    @property
+    def pending(self) -> int:
+        """As `Evaluator.pending`, over all members."""
+        return sum(member.pending for member in self.members)
+
+    def record(self) -> None:
+        """As `Evaluator.record`, on every member."""
+        for member in self.members:
+            member.record()
+
     def follow(self, schedule: Schedule) -> float:
         """As `Evaluator.follow`, on every member."""
         costs = torch.tensor([[member.follow(schedule)] for member in self.members], dtype=torch.float64)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hmc
-from hmc import Budget, Plan, PlanInterrupted, Schedule, plan
+from hmc import Budget, Plan, PlanInterrupted, Rules, Schedule, plan
 from tests.toy import Bad, Damp, Push, Ramp, ToySim, slow_cost, toy_task
 
 X = [0.4, -0.2]
@@ -130,6 +130,17 @@ def test_a_control_step_budget_is_never_exceeded(solver, steps):
     if steps >= 60:
         assert result.control_steps > steps - 16, "what fits is used"
         assert result.cost < result.incumbent_cost
+
+
+@pytest.mark.parametrize("worlds", [1, 2, 5, 40])
+@pytest.mark.parametrize("rules", [None, Rules(max_changes=2)])
+def test_all_control_steps_are_within_the_budget_and_reported(worlds, rules):
+    """Those of recording what was found included, whatever fits into the simulator."""
+    for steps in range(20, 200, 12):
+        sim = ToySim(worlds)
+        task = replace(toy_task(12), rules=rules)
+        found = plan(task, FAR, samples=4, pairs=2, seed=steps, sim=sim, budget=Budget(control_steps=steps))
+        assert sum(map(len, sim.stepped)) == found.control_steps <= steps
 
 
 def test_control_steps_inside_modes_count():
