@@ -52,7 +52,7 @@ def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
     before[:, 1:], before[: len(trunk), 0], before[len(trunk) :, 0] = rows[:, :-1], trunk, -1
     apart = before != rows
     birth = np.where(apart.any(0), apart.argmax(0), horizon)
-    slots = np.argsort(birth.astype(rows.dtype), kind="stable")
+    slots = np.argsort(birth.astype(np.uint16 if horizon < 2**16 else np.int64), kind="stable")
     rank = np.empty_like(slots)
     rank[slots] = np.arange(n)
     born = [0, *np.cumsum(np.bincount(birth, minlength=horizon + 1)).tolist()]
@@ -122,5 +122,6 @@ def in_order(schedules: Tensor, trunk: Sequence[int]) -> np.ndarray:
 
 
 def _steps(schedules: Tensor) -> np.ndarray:
-    """Schedules (n, T) as (T, n), a step's modes side by side."""
-    return np.ascontiguousarray(schedules.numpy().T)
+    """Schedules (n, T) as (T, n), a step's modes side by side, in a type with room for M and -1."""
+    rows = schedules.numpy().T
+    return np.ascontiguousarray(rows, dtype=np.int16 if rows.itemsize == 1 else rows.dtype)

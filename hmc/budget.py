@@ -84,5 +84,8 @@ class Meter:
 
     @property
     def _nested(self) -> float:
-        """Control steps over those that were not made inside a mode, so far."""
-        return self.evaluator.control_steps / max(1, self.evaluator.own_steps)
+        """Control steps made for each that is not made inside a mode, as far as that is known by now."""
+        evaluator = self.evaluator
+        inside = evaluator.control_steps - evaluator.own_steps
+        # a few steps say little: one of them may have been a mode's re-planning
+        return 1 + inside / max(evaluator.own_steps, evaluator.task.horizon)

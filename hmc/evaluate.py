@@ -124,7 +124,7 @@ class Evaluator:
     def needs(self, schedules: Tensor) -> NDArray[np.int64]:
         """Control steps, modes' own aside, that the costs of the first 1, 2, ... of schedules (N, T) take.
 
-        Fewer if some are pruned or barred.
+        Fewer if some are pruned or barred; none for those that break a rule.
         """
         new = self._table.missing(self._table.find(self._table.keys(schedules)), math.inf)
         if self.task.rules is not None:

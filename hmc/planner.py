@@ -39,7 +39,8 @@ class Plan:
         seen: switches of `schedule` that were evaluated and do not improve it.
         space_size: Z, how many there are.
         draws: switches evaluated in the whole search, repeats included.
-        rollouts: schedules rolled out; fewer than draws, as equal ones are rolled out once.
+        rollouts: schedules rolled out; fewer than draws, as equal ones are rolled out once. This and the
+            other counts are not compared: what is pruned before it diverges depends on the simulator's size.
         control_steps: control steps rolled out, over all worlds and inside the modes; not compared, as
             schedules share their beginnings only where a batch fits into the simulator.
         diverged: rollouts whose world stopped being finite; their cost is inf.
@@ -61,10 +62,10 @@ class Plan:
     seen: int
     space_size: int
     draws: int
-    rollouts: int
+    rollouts: int = field(compare=False)
     control_steps: int = field(compare=False)
-    diverged: int
-    ruled_out: int
+    diverged: int = field(compare=False)
+    ruled_out: int = field(compare=False)
     fell_back: bool
     stopped_by: str
     elapsed: float = field(compare=False)
@@ -194,8 +195,8 @@ def plan(
         solver: "sample" (Algorithms 1 and 2) takes the best of the first batch that improves; "exhaustive"
             (Algorithm 1) evaluates all of Omega and takes the best.
         samples: N, switches drawn a batch.
-        max_samples: batches double up to this size while nothing improves, since many at once are cheaper
-            each; 0 for N throughout.
+        max_samples: the batches of one iteration double up to this size, since many at once are cheaper each;
+            0 for N throughout.
         order: of "sample"'s draws: "uniform", as Theorem 2 has it, or "tails": the switches that last to
             the end of the horizon first. Either way each switch comes once.
         pairs: further draws that "sample" makes beside each batch, of two switches stitched at once (see

@@ -72,7 +72,7 @@ class EnsembleEvaluator:
     def costs(
         self, schedules: Tensor, bound: float = math.inf, stop: Callable[[], bool] | None = None
     ) -> Tensor:
-        """Risks of schedules (N, T) long -> (N,) float64; as `Evaluator.costs`."""
+        """Risks of schedules (N, T) -> (N,) float64; as `Evaluator.costs`."""
         size = len(self.members)
         costs = torch.full((size, len(schedules)), math.inf, dtype=torch.float64)
         # costs >= 0: the risk is at least this share of any member's cost, rounding aside
@@ -85,15 +85,10 @@ class EnsembleEvaluator:
         known = ~costs.isnan().any(0)
         return torch.where(known, self.ensemble.risk(costs.nan_to_num(0.0, posinf=math.inf)), math.nan)
 
-    @property
-    def pending(self) -> int:
-        """As `Evaluator.pending`, over all members."""
-        return sum(member.pending for member in self.members)
+    pending = 0  # nothing goes on from what an ensemble recorded, so that it does not at the end
 
     def record(self) -> None:
-        """As `Evaluator.record`, on every member."""
-        for member in self.members:
-            member.record()
+        """As `Evaluator.record`; does nothing."""
 
     def follow(self, schedule: Schedule) -> float:
         """As `Evaluator.follow`, on every member."""

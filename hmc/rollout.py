@@ -43,7 +43,7 @@ def roll(
     schedules: Tensor,
     bound: float = math.inf,
     stop: Callable[[], bool] | None = None,
-    record: tuple[int, ...] | None = None,
+    recorded: tuple[int, ...] | None = None,
 ) -> Rolled | None:
     r"""Roll out schedules (n, T), n <= num_worlds, in step: J = sum_i l_i dt + c_f(x_T, k + T).
 
@@ -54,18 +54,18 @@ def roll(
     Args:
         worlds: where to; the first n are used.
         trunk: where from, and what is known already.
-        schedules: mode indices, long.
+        schedules: mode indices.
         bound: where cost terms are non-negative, a world is given up once its partial cost, with the task's
             lower bound of the rest, exceeds this.
         stop: asked before every control step; when it says True the rollout ends with None.
-        record: a schedule that is rolled out beside the others, whatever the bound, and recorded; the
+        recorded: a schedule that is rolled out beside the others, whatever the bound, and recorded; the
             simulator has a world for it too.
     """
     rows = schedules.cpu()
-    if record is not None:
-        rows = torch.cat([torch.tensor([record], dtype=rows.dtype), rows])
+    if recorded is not None:
+        rows = torch.cat([torch.tensor([recorded], dtype=rows.dtype), rows])
     tree = branches(rows, trunk.modes[: len(trunk)])
-    recorder = None if record is None else Recorder(trunk, record, tree.path(0))
+    recorder = None if recorded is None else Recorder(trunk, recorded, tree.path(0))
     rollout = _Rollout(worlds, trunk, tree, bound, recorder)
     for i in range(rows.shape[1] + 1):
         if stop is not None and stop():
@@ -84,7 +84,7 @@ def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
     if modes == known.modes:
         return known
     none = torch.empty(0, len(modes), dtype=torch.long)
-    rolled = roll(worlds, known, none, record=modes)
+    rolled = roll(worlds, known, none, recorded=modes)
     assert rolled is not None
     assert rolled.trace is not None
     return rolled.trace
@@ -116,7 +116,7 @@ class _Rollout:
         watched = -1 if self.recorder is None else self.recorder.path[i]
         if self.recorder is not None and watched >= 0 and bool(self.going[watched]):
             self.recorder.arrive(self.worlds, i, watched)
-        x = sim.x(self._worlds)
+        x = sim.x(self._at)
         if not math.isfinite(float(x.sum())):  # a finite sum has finite parts
             (x,) = self._drop(~finite(x), x)
         if len(x) > 0 and i == self.horizon:
@@ -128,7 +128,7 @@ class _Rollout:
             x = self._give_up(i, x, k)
         if len(x) == 0:
             return
-        u_prev = sim.u(self._worlds)
+        u_prev = sim.u(self._at)
         u = self.worlds.act(self.ids, self._modes(i), x, u_prev, k)
         stage = stage_terms(task, x, u, u_prev, k, sim.dt).T
         self.terms[: self.stages, self.ids] += stage
@@ -136,11 +136,11 @@ class _Rollout:
         if self.recorder is not None and watched >= 0 and bool(self.going[watched]):
             place = watched if isinstance(self.ids, slice) else int((self.ids == watched).nonzero())
             if bool((partial[place] + u[place].sum()).isfinite()):
-                self.recorder.step(stage[:, place])
+                self.recorder.step(stage[:, place].clone())
         if not math.isfinite(float(partial.sum() + u.sum())) or self._beyond(partial).any():
             (u,) = self._prune(partial, finite(u), u)
         if len(u) > 0:
-            sim.step(u, self._worlds)
+            sim.step(u, self._at)
             self.worlds.own_steps += len(u)
 
     def rolled(self, rows: Tensor) -> Rolled:
@@ -166,7 +166,7 @@ class _Rollout:
         )
 
     @property
-    def _worlds(self) -> Ids:
+    def _at(self) -> Ids:
         """The worlds of `ids`; None, which costs least, where they are all."""
         return None if count(self.ids, self.sim.num_worlds) == self.sim.num_worlds else self.ids
 
@@ -206,6 +206,8 @@ class _Rollout:
             steps = torch.full((len(x),), k, device=x.device)
             least = total(self.terms[:, self.ids].T) - self.slack
             least += rest(x, steps, self.horizon - i).to(torch.float64)
+            # hopeless is pruned as well, and a bound that is no number bounds nothing
+            least = least.nan_to_num(nan=0.0)
             if self._beyond(least).any():
                 (x,) = self._prune(least, torch.ones_like(least, dtype=torch.bool), x)
         return x

@@ -50,7 +50,7 @@ class Rules:
             raise ValueError(f"rules.max_changes must be >= 0, got {self.max_changes}")
 
     def broken(self, modes: ModeSet, schedules: Tensor, mode: int | None, ran: int | None) -> Tensor:
-        """Which of schedules (N, T) long break a rule, whatever the states will be, (N,) bool.
+        """Which of schedules (N, T) break a rule, whatever the states will be, (N,) bool.
 
         Args:
             modes: what the indices mean.

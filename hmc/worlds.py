@@ -57,10 +57,9 @@ class Worlds:
             self.memory[children] = self.memory[parents]
 
     def barred(self, ids: Ids, modes: Tensor, x: Tensor, k: int) -> Tensor:
-        """Which of worlds `ids` would enter a mode whose guard bars it, (n,) bool; arguments as in `act`."""
+        """Which of worlds `ids` enter a mode that the task's guards bar, (n,) bool; arguments as in `act`."""
         rules = self.task.rules
-        if rules is None or not rules.guards:
-            return torch.zeros_like(modes, dtype=torch.bool)
+        assert rules is not None
         entered = modes != self.mode[where(ids)]
         return rules.barred(self.task.modes, entered, modes, x, torch.full_like(modes, k))
 

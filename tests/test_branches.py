@@ -48,6 +48,22 @@ def test_neighbours_in_order_share_most():
     assert in_order(rows, [1, 0, 1]).tolist() == [2, 0, 1, 3, 4]
 
 
+def test_small_types_are_as_good():
+    """T and M + 1 are beyond what a byte holds."""
+    rows = torch.randint(0, 100, (20, 200), generator=torch.Generator().manual_seed(0))
+    rows[10:] = rows[:10]
+    rows[10:, 150:] = 99 - rows[10:, 150:]
+    trunk = rows[3].tolist()
+    wide = branches(rows, trunk)
+    for kind in (torch.int8, torch.uint8, torch.int16):
+        small = branches(rows.to(kind), trunk)
+        assert torch.equal(small.row, wide.row)
+        assert torch.equal(small.modes.long(), wide.modes)
+        assert (small.born, small.parent.tolist()) == (wide.born, wide.parent.tolist())
+    full = torch.tensor([[255, 0], [0, 255], [255, 255]], dtype=torch.uint8)
+    assert branches(full, [255, 0]).modes.tolist() == [[0, 255], [255, 255], [255, 0]]
+
+
 @given(data=st.data(), modes=st.integers(1, 4), horizon=st.integers(1, 6), n=st.integers(0, 20))
 def test_added_steps_are_the_new_beginnings(data, modes, horizon, n):
     mode = st.integers(0, modes - 1)

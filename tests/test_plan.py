@@ -143,6 +143,30 @@ def test_all_control_steps_are_within_the_budget_and_reported(worlds, rules):
         assert sum(map(len, sim.stepped)) == found.control_steps <= steps
 
 
+def test_a_budget_counts_although_nothing_had_to_be_stepped_yet():
+    """The incumbent is known from before, or breaks a rule: searches on, and within the budget."""
+    task = toy_task(6)
+    known = plan(task, FAR, iterations=0).known
+    wild = replace(task, rules=Rules(max_changes=1))
+    for one, options in ((task, {"known": known}), (wild, {"schedule": [0, 1, 0, 1, 0, 1]})):
+        sim = ToySim(9)
+        found = plan(one, FAR, samples=8, sim=sim, budget=Budget(control_steps=60), **options)
+        assert found.draws > 0
+        assert sum(map(len, sim.stepped)) == found.control_steps <= 60
+        assert found.cost < plan(one, FAR, iterations=0, **options).cost
+
+
+def test_hopeless_is_pruned_not_diverged():
+    base = toy_task(8)
+    bounded = replace(
+        base, lower_bound=lambda x, k, steps: torch.where(x[:, 0].abs() > 3, math.inf, math.nan)
+    )
+    found, plain = (plan(task, FAR, samples=16, seed=1) for task in (bounded, base))
+    assert found.diverged == 0
+    assert found.cost <= found.incumbent_cost
+    assert plain.diverged == 0
+
+
 def test_control_steps_inside_modes_count():
     class Nested(Damp):
         def act(self, x, u, memory, k):
