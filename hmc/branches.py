@@ -46,8 +46,9 @@ class Branches:
 def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
     """The tree of schedules (n, T), mode indices, around `trunk` (t modes)."""
     n, horizon = schedules.shape
-    order = in_order(schedules, trunk)
-    rows = _steps(schedules)[:, order]
+    steps = _steps(schedules)
+    order = _order(steps, trunk)
+    rows = steps[:, order]
     before = np.empty_like(rows)  # the one before each; the first comes after the trunk
     before[:, 1:], before[: len(trunk), 0], before[len(trunk) :, 0] = rows[:, :-1], trunk, -1
     apart = before != rows
@@ -77,8 +78,9 @@ def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
 def added_steps(schedules: Tensor, trunk: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Steps that each of schedules (n, T) adds to `trunk` and those before it, and to `trunk` alone, (n,)."""
     n, horizon = schedules.shape
-    order = in_order(schedules, trunk)
-    rows = _steps(schedules)[:, order]
+    steps = _steps(schedules)
+    order = _order(steps, trunk)
+    rows = steps[:, order]
     # what each, in order, shares with the one before; `most` is with the trunk, which is always there
     apart = rows[:, 1:] != rows[:, :-1]
     shared = [0, *np.where(apart.any(0), apart.argmax(0), horizon).tolist(), 0]
@@ -102,7 +104,11 @@ def added_steps(schedules: Tensor, trunk: Sequence[int]) -> tuple[np.ndarray, np
 
 def in_order(schedules: Tensor, trunk: Sequence[int]) -> np.ndarray:
     """Order of schedules (n, T) with common beginnings side by side, those nearest to the trunk first."""
-    steps = _steps(schedules)
+    return _order(_steps(schedules), trunk)
+
+
+def _order(steps: np.ndarray, trunk: Sequence[int]) -> np.ndarray:
+    """As `in_order`, of steps (T, n)."""
     horizon, n = steps.shape
     # the trunk's mode becomes the first of each step's alphabet, so that the trunk sorts before all others
     swapped, lead = steps + 1, np.asarray(trunk, dtype=steps.dtype)[:, None]

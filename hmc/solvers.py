@@ -28,7 +28,7 @@ class Search:
         rng: where draws come from.
         order: of the draws, one of ORDERS.
         pairs: draws beside each batch that stitch two switches at once.
-        most: size that batches double to while nothing improves; none beyond N if smaller.
+        max_samples: size that batches of one iteration double to; N throughout if that is larger.
         report: told after every batch and accepted switch; False ends the search.
         costs: the incumbent's cost, then the cost after each accepted switch or pair.
         switches: accepted switches.
@@ -44,7 +44,7 @@ class Search:
     rng: np.random.Generator
     order: str = "uniform"
     pairs: int = 0
-    most: int = 0
+    max_samples: int = 0
     report: Callable[[Search], bool | None] = lambda _: None
     costs: list[float] = field(default_factory=list)
     switches: list[Switch] = field(default_factory=list)
@@ -92,7 +92,7 @@ class Search:
             if self.stopped_by or not known.all():
                 self.stopped_by = self.stopped_by or "seconds"
                 return
-            size = max(self.samples, min(2 * size, self.most))
+            size = max(self.samples, min(2 * size, self.max_samples))
             self.tell()
 
     def offer(self, switches: Sequence[Switch], cost: float) -> None:
