@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from hmc.go2 import model as go2
+from hmc.go2.conditions import NoiseCfg
 from hmc.go2.observe import OBS_SIZE, observe, pitch
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STANCES
 from tests.tiny import CFG, make_env
 from tools.random_policy import write_random_policy
 from train import evaluate
-from train.env import NoiseCfg
 from train.starts import HOME, KINDS, RECORDED, STANCE, WAY, Starts, StartsCfg
 
 CPU = torch.device("cpu")

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from hmc import Budget, plan
-from hmc.go2.ensemble import EnsembleCfg, make_ensemble, perturbed_model
+from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.model import load_model, motor_torque
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import FlipCfg, flip_task
+from hmc.go2.variants import Variant, VariantsCfg
 from tools.random_policy import write_random_policy
 
 
@@ -22,7 +23,7 @@ def centre_of_mass(model) -> np.ndarray:
 
 
 def test_mass_and_centre_of_mass():
-    nominal, other = load_model(), perturbed_model(payload=1.5, com=(0.02, -0.01, 0.03))
+    nominal, other = load_model(), Variant(payload=1.5, com=(0.02, -0.01, 0.03)).model()
     total = nominal.body_mass.sum()
     assert other.body_mass.sum() == pytest.approx(total + 1.5)
     assert other.body_subtreemass[1] == pytest.approx(total + 1.5), "derived figures follow"
@@ -30,14 +31,14 @@ def test_mass_and_centre_of_mass():
     moment = total * centre_of_mass(nominal) + 1.5 * (trunk.ipos + np.array([0.02, -0.01, 0.475]))
     moment += trunk.mass[0] * np.array([0.02, -0.01, 0.03])
     np.testing.assert_allclose(centre_of_mass(other), moment / (total + 1.5), atol=1e-12)
-    same = perturbed_model()
+    same = Variant().model()
     np.testing.assert_array_equal(same.body_mass, nominal.body_mass)
     np.testing.assert_array_equal(same.geom_friction, nominal.geom_friction)
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.9])
 def test_friction_of_the_feet_on_the_floor(friction):
-    model = perturbed_model(friction=friction)
+    model = Variant(friction=friction).model()
     data = mujoco.MjData(model)
     data.qpos[2] = 0.28
     data.qpos[7:] = np.tile([0.0, 0.9, -1.8], 4)
@@ -49,7 +50,7 @@ def test_friction_of_the_feet_on_the_floor(friction):
 @pytest.mark.parametrize("strength", [0.9, 1.1])
 def test_motors_give_so_many_times_the_torque(strength):
     """Anywhere on the torque-speed curve: driving, braking, saturated."""
-    model, rng = perturbed_model(strength=strength), np.random.default_rng(0)
+    model, rng = Variant(strength=strength).model(), np.random.default_rng(0)
     data = mujoco.MjData(model)
     for _ in range(200):
         q, qd = rng.uniform(-1, 1, 12), rng.uniform(-28, 28, 12)
@@ -97,7 +98,9 @@ def test_a_flip_is_planned_on_all_members(tmp_path):
 def test_bad_values():
     with pytest.raises(ValueError, match=r"ensemble\.members must be >= 0, got -1"):
         EnsembleCfg(members=-1)
-    with pytest.raises(ValueError, match=r"ensemble\.friction must be \(lowest, highest\), got 1\.0, 0\.5"):
-        EnsembleCfg(friction=(1.0, 0.5))
-    with pytest.raises(ValueError, match=r"ensemble\.latency must be within 0 and a control step of 0\.02 s"):
-        EnsembleCfg(latency=(0.0, 0.03))
+    with pytest.raises(ValueError, match=r"variants\.friction must be \(lowest, highest\), got 1\.0, 0\.5"):
+        VariantsCfg(friction=(1.0, 0.5))
+    with pytest.raises(ValueError, match=r"variants\.stiffness must be above 0, got \(0\.0, 1\.0\)"):
+        VariantsCfg(stiffness=(0.0, 1.0))
+    with pytest.raises(ValueError, match=r"variants\.latency must be within 0 and a control step of 0\.02 s"):
+        VariantsCfg(latency=(0.0, 0.03))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import pytest
 import torch
@@ -73,8 +75,13 @@ def test_sizes(model):
         make_sim(model, 1, "mujoco", substeps=0)
     with pytest.raises(ValueError, match="num_worlds must be at least 1, got 0"):
         make_sim(model, 0, "warp", device="cpu")
-    with pytest.raises(ValueError, match="latency must be 0 to 4 physics steps, a control step, got 5"):
-        MujocoSim(model, 1, latency=5)
+    for worlds, latency in ((1, 5), (3, (0, 1)), (2, (0, -1))):
+        with pytest.raises(
+            ValueError, match=f"latency must be 0 to 4 .* {worlds}; got {re.escape(str(latency))}"
+        ):
+            MujocoSim(model, worlds, latency=latency)
+    with pytest.raises(ValueError, match="engine warp has one model in all worlds and no latency yet"):
+        make_sim(model, 1, "warp", device="cpu", latency=1)
     with pytest.raises(ValueError, match="substeps must be at least 1, got 0"):
         make_sim(model, 1, "warp", device="cpu", substeps=0)
 

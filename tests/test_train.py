@@ -88,6 +88,21 @@ def test_resume_goes_on_where_it_was(trained):
     assert read_checkpoint(folder / "latest.pt")["iter"] == 2
 
 
+def test_a_stage_begins_with_what_was_learned(trained, tmp_path):
+    """Networks and curriculum, not the optimiser's moments nor the count of iterations."""
+    folder, runner, _ = trained
+    runner.env.starts.rates[0] = 0.7
+    runner.save(str(folder / "model_1.pt"))
+    other = make_runner(tmp_path)
+    other.begin_with(str(folder / "latest.pt"))
+    assert other.current_learning_iteration == 0
+    assert other.logger.tot_timesteps == 96, "of all stages"
+    assert torch.equal(other.env.starts.rates, runner.env.starts.rates)
+    theirs = runner.alg.actor.state_dict()
+    assert all(torch.equal(value, theirs[key]) for key, value in other.alg.actor.state_dict().items())
+    assert not other.alg.optimizer.state_dict()["state"]
+
+
 def test_the_same_seed_learns_the_same(tmp_path):
     weights = []
     for name in ("a", "b"):
@@ -187,6 +202,11 @@ def test_bad_input_is_one_line(capsys, tmp_path):
     assert "latest.pt: no such file" in refused(capsys, resume=True, out=tmp_path)
     assert "gone.pt: no such file" in refused(capsys, checkpoint=tmp_path / "gone.pt", out=tmp_path)
     assert "gone.pt: no such file" in refused(capsys, play=tmp_path / "gone.pt", out=tmp_path)
+    line = refused(capsys, stage="finer")
+    assert "handstand_finer.toml: no such file" in line
+    assert "handstand_robust.toml" in line
+    line = refused(capsys, stage="robust", checkpoint=tmp_path / "gone.pt", set=("env.worlds=2",))
+    assert "gone.pt: no such file" in line
     assert not list(tmp_path.iterdir())
 
 
@@ -250,9 +270,9 @@ def test_only_the_first_process_writes(tmp_path):
 
 
 def test_experiment_files():
-    for mode in ("handstand", "footstand"):
-        cfg = load(ppo.ROOT / "cfg" / f"{mode}.toml", TrainCfg)
-        assert cfg.env.mode == mode
+    for name in ("handstand", "footstand", "handstand_robust", "footstand_robust"):
+        cfg = load(ppo.ROOT / "cfg" / f"{name}.toml", TrainCfg)
+        assert cfg.env.mode == name.removesuffix("_robust")
         assert sum(
             getattr(cfg.env.starts, kind) for kind in ("stance", "way", "home", "recorded")
         ) == pytest.approx(1)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hmc.go2.model import load_model
-from hmc.sim.mujoco import MujocoSim
+from train import env
 from train.config import PpoCfg, TrainCfg, metadata, rsl_config
 from train.env import EnvCfg, StanceEnv
 from train.runner import Runner
@@ -20,7 +19,7 @@ CFG = TrainCfg(
 
 def make_env(cfg: EnvCfg = CFG.env) -> StanceEnv:
     """The environment on the C engine, one thread."""
-    return StanceEnv(cfg, MujocoSim(load_model(), cfg.worlds, threads=1))
+    return env.make_env(cfg, "mujoco", threads=1)
 
 
 def make_runner(folder: Path, cfg: TrainCfg = CFG, argv: tuple[str, ...] = (), seed: int = 7) -> Runner:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from train.env import EnvCfg
+from train.env import EnvCfg, both_sides
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -33,6 +33,8 @@ class PpoCfg:
         entropy: weight of the action entropy.
         clip: of the probability ratio.
         init_std: of the action noise, in network units.
+        mirror: weight of the mean squared difference between the action on the mirror image of what the robot
+            sees and the mirror image of its action (Mittal et al. 2024); 0 for none.
         hidden: layer sizes of actor and critic.
     """
 
@@ -47,6 +49,7 @@ class PpoCfg:
     entropy: float = 0.005
     clip: float = 0.2
     init_std: float = 0.35
+    mirror: float = 0.0
     hidden: tuple[int, ...] = (256, 128, 64)
 
 
@@ -64,6 +67,7 @@ def rsl_config(cfg: PpoCfg) -> dict[str, Any]:
         class_name="MLPModel", hidden_dims=list(cfg.hidden), activation="swish", obs_normalization=True
     )
     noise = dict(class_name="GaussianDistribution", init_std=cfg.init_std, std_type="log")
+    symmetry = dict(data_augmentation_func=both_sides, use_mirror_loss=True, mirror_loss_coeff=cfg.mirror)
     return dict(
         num_steps_per_env=cfg.steps,
         save_interval=50,
@@ -82,6 +86,7 @@ def rsl_config(cfg: PpoCfg) -> dict[str, Any]:
             entropy_coef=cfg.entropy,
             clip_param=cfg.clip,
             max_grad_norm=1.0,
+            symmetry_cfg=symmetry if cfg.mirror > 0 else None,
         ),
     )
 

@@ -17,10 +17,8 @@ import tyro  # noqa: E402
 
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
-from hmc.go2.model import load_model  # noqa: E402
-from hmc.sim.make import make_sim  # noqa: E402
 from train.config import TrainCfg, metadata, rsl_config  # noqa: E402
-from train.env import StanceEnv  # noqa: E402
+from train.env import make_env  # noqa: E402
 from train.runner import Runner  # noqa: E402
 
 
@@ -30,11 +28,13 @@ class Args:
 
     Attributes:
         mode: which mode; its settings are in cfg/MODE.toml.
+        stage: a further stage, set in cfg/MODE_STAGE.toml; it begins with the networks of --checkpoint, or of
+            out/train/MODE/latest.pt.
         engine: auto takes MuJoCo Warp where a GPU is there, else C MuJoCo.
         device: of engine and networks, such as cpu or cuda:0; auto takes a GPU if there is one.
         threads: of the C engine and of torch; 0 for all cores.
         seed: of everything random.
-        out: folder for checkpoints and logs; default out/train/MODE.
+        out: folder for checkpoints and logs; default out/train/MODE or out/train/MODE_STAGE.
         resume: go on from the latest checkpoint in `out`, or from the file given by --checkpoint.
         checkpoint: a file to begin from (weights, optimiser, curriculum).
         iterations: overrides the configuration's.
@@ -43,6 +43,7 @@ class Args:
     """
 
     mode: Literal["handstand", "footstand"]
+    stage: str = ""
     engine: Literal["auto", "mujoco", "warp"] = "auto"
     device: str = "auto"
     threads: int = 0
@@ -55,9 +56,14 @@ class Args:
     play: Path | None = None
 
     @property
+    def name(self) -> str:
+        """Of the configuration file, without its ending."""
+        return f"{self.mode}_{self.stage}" if self.stage else self.mode
+
+    @property
     def folder(self) -> Path:
         """Where everything is written."""
-        return self.out or ROOT / "out" / "train" / self.mode
+        return self.out or ROOT / "out" / "train" / self.name
 
 
 def under_torchrun(args: Args) -> Args:
@@ -74,18 +80,19 @@ def under_torchrun(args: Args) -> Args:
 
 def set_up(args: Args) -> Runner:
     """Everything that training needs; what the user got wrong is a ValueError."""
-    cfg = load(ROOT / "cfg" / f"{args.mode}.toml", TrainCfg, args.set)
+    cfg = load(ROOT / "cfg" / f"{args.name}.toml", TrainCfg, args.set)
     args = under_torchrun(args)
     torch.manual_seed(args.seed)
     if args.threads:
         torch.set_num_threads(args.threads)
     device = None if args.device == "auto" else args.device
-    sim = make_sim(load_model(), cfg.env.worlds, args.engine, device=device, threads=args.threads)
-    env = StanceEnv(cfg.env, sim)
+    env = make_env(cfg.env, args.engine, device=device, threads=args.threads, seed=args.seed)
     meta = metadata(cfg, sys.argv[1:], args.seed)
-    runner = Runner(env, rsl_config(cfg.ppo), str(args.folder), str(sim.device), meta)
+    runner = Runner(env, rsl_config(cfg.ppo), str(args.folder), str(env.device), meta)
     checkpoint = args.checkpoint or (args.folder / "latest.pt" if args.resume else None)
-    if checkpoint is not None:
+    if args.stage and not args.resume:
+        runner.begin_with(str(checkpoint or ROOT / "out" / "train" / args.mode / "latest.pt"))
+    elif checkpoint is not None:
         runner.resume(str(checkpoint))
     runner.last_iteration = args.iterations or cfg.ppo.iterations
     runner.anneal = cfg.ppo.anneal

@@ -86,10 +86,26 @@ class Runner(OnPolicyRunner):
         self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
         return True
 
-    def resume(self, path: str, *, fresh_optimizer: bool = False) -> None:
+    def resume(self, path: str) -> None:
         """Go on from a checkpoint; an error names the file and what is wrong with it."""
-        data = read_checkpoint(path)
-        what = {"actor": True, "critic": True, "optimizer": not fresh_optimizer, "iteration": True}
+        rng = self._restore(path, everything=True)["rng"]
+        self.current_learning_iteration += 1
+        if self.gpu_global_rank:  # the other processes of torchrun keep a noise of their own
+            return
+        torch.set_rng_state(rng["torch"].cpu())
+        np.random.set_state(rng["numpy"])
+        random.setstate(rng["python"])
+        if "cuda" in rng and self.device.startswith("cuda"):
+            torch.cuda.set_rng_state(rng["cuda"].cpu(), self.device)
+
+    def begin_with(self, path: str) -> None:
+        """Begin a stage of training with the networks and the curriculum of another one's checkpoint."""
+        self._restore(path, everything=False)
+
+    def _restore(self, path: str, *, everything: bool) -> dict[str, Any]:
+        """Networks, curriculum and counts of a checkpoint, or everything; its further contents."""
+        infos: dict[str, Any] = read_checkpoint(path)["infos"]
+        what = {"actor": True, "critic": True, "optimizer": everything, "iteration": everything}
         try:
             self.load(path, what, map_location=self.device)
         except RuntimeError as error:
@@ -98,18 +114,9 @@ class Runner(OnPolicyRunner):
                 f"{self.cfg['actor']['hidden_dims']}: set ppo.hidden as it was trained with"
             ) from error
         self._fuse()
-        infos = data["infos"]
-        self.current_learning_iteration += 1
         self.logger.tot_timesteps, self.logger.tot_time = infos["steps"], infos["seconds"]
         self.env.starts.load_state_dict(infos["starts"])
-        if self.gpu_global_rank:  # the other processes of torchrun keep a noise of their own
-            return
-        rng = infos["rng"]
-        torch.set_rng_state(rng["torch"].cpu())
-        np.random.set_state(rng["numpy"])
-        random.setstate(rng["python"])
-        if "cuda" in rng and self.device.startswith("cuda"):
-            torch.cuda.set_rng_state(rng["cuda"].cpu(), self.device)
+        return infos
 
     def set_learning_rate(self, iteration: int) -> None:
         """That of an iteration: as configured, and falling to almost nothing over the last ones."""

@@ -9,6 +9,8 @@ import torch
 from hmc.sim.device import devices, find_device
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import mujoco
 
     from hmc.sim.base import Sim
@@ -24,6 +26,8 @@ def make_sim(
     device: str | torch.device | None = None,
     substeps: int = 4,
     threads: int = 0,
+    latency: int | Sequence[int] = 0,
+    models: Sequence[mujoco.MjModel] | None = None,
 ) -> Sim:
     """Worlds of a MuJoCo model on the engine asked for; see `hmc.sim.base.Sim`.
 
@@ -34,6 +38,8 @@ def make_sim(
         device: where to simulate; left out, a GPU if there is one, unless the engine is "mujoco".
         substeps: physics steps a control step.
         threads: of the C engine; 0 for all cores.
+        latency: of the inputs, see `hmc.sim.mujoco.MujocoSim`; of the C engine only.
+        models: one of each world; of the C engine only.
 
     Raises:
         ValueError: an engine that is not known, a device that does not exist, or the two do not fit.
@@ -51,7 +57,13 @@ def make_sim(
             )
         from hmc.sim.mujoco import MujocoSim
 
-        return MujocoSim(model, num_worlds, substeps=substeps, threads=threads)
+        return MujocoSim(
+            model, num_worlds, substeps=substeps, threads=threads, latency=latency, models=models
+        )
+    if models is not None or latency != 0:
+        raise ValueError(
+            "engine warp has one model in all worlds and no latency yet: take engine mujoco for other ones"
+        )
     if there is None and not torch.cuda.is_available():
         raise ValueError(f"engine warp wants a GPU and {devices()}: take engine mujoco, its fast CPU sibling")
     try:

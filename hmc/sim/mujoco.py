@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import mujoco
 import torch
 from mujoco.batch import Batch
@@ -23,18 +26,32 @@ class MujocoSim:
         num_worlds: number of worlds W.
         substeps: physics steps a control step.
         threads: threads that step worlds, the caller's included; 0 for all cores.
-        latency: physics steps of a control step in which the input before it still acts.
+        latency: physics steps of a control step in which the input before it still acts; one of all worlds
+            or one of each.
+        models: a model of each world, compiled from the same file as `model` with other values; None for
+            `model` in all of them.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, num_worlds: int, *, substeps: int = 4, threads: int = 0, latency: int = 0
+        self,
+        model: mujoco.MjModel,
+        num_worlds: int,
+        *,
+        substeps: int = 4,
+        threads: int = 0,
+        latency: int | Sequence[int] = 0,
+        models: Sequence[mujoco.MjModel] | None = None,
     ):
         if num_worlds < 1:
             raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, got {substeps}")
-        if not 0 <= latency <= substeps:
-            raise ValueError(f"latency must be 0 to {substeps} physics steps, a control step, got {latency}")
+        late = [latency] * num_worlds if isinstance(latency, int) else list(latency)
+        if len(late) != num_worlds or not 0 <= min(late) <= max(late) <= substeps:
+            raise ValueError(
+                f"latency must be 0 to {substeps} physics steps, a control step, one of all worlds or one of "
+                f"each of the {num_worlds}; got {latency}"
+            )
         if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET:
             raise ValueError(
                 "the model resets diverged worlds by itself, which would hide them from the planner: "
@@ -44,7 +61,11 @@ class MujocoSim:
         mujoco.set_mju_user_warning(_quiet)
         self.model = model
         self.batch = Batch(model, num_worlds, threads)
-        self._substeps, self._latency = substeps, latency
+        if models is not None:
+            self.batch.set_models(list(models))
+        self._substeps, self._late = substeps, torch.tensor(late)
+        # a control step's stretches: after so many physics steps, the inputs that arrive then begin to act
+        self._arrivals = sorted({0, *late})
         self._row = torch.from_numpy(self.batch.state)
         self._qpos = torch.from_numpy(self.batch.bind("qpos"))
         self._qvel = torch.from_numpy(self.batch.bind("qvel"))
@@ -96,27 +117,34 @@ class MujocoSim:
         index = self._all[ids] if isinstance(ids, slice) else ids
         # the engine takes indices in ascending order only
         order = None if index is None else index.sort().values.numpy()
-        if self._latency > 0:
-            self.batch.step(order, nstep=self._latency)
-        self._ctrl[where(ids)] = u.to(torch.float64)
-        if self._latency < self._substeps:
-            self.batch.step(order, nstep=self._substeps - self._latency)
+        if len(self._arrivals) == 1:
+            self._ctrl[where(ids)] = u.to(torch.float64)
+            self.batch.step(order, nstep=self._substeps)
+            return
+        index = self._all if index is None else index
+        for begin, end in pairwise([*self._arrivals, self._substeps]):
+            now = self._late[index] == begin
+            self._ctrl[index[now]] = u[now].to(torch.float64)
+            if end > begin:
+                self.batch.step(order, nstep=end - begin)
 
     def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
         """States after each control step under given inputs, as `hmc.sim.base.rollout`, in one call."""
         check(self.num_worlds, ids, controls=(controls[:, 0], self.nu))
         order = ids.argsort()  # the engine takes indices in ascending order only
         held = controls[order].repeat_interleave(self._substeps, 1).to(torch.float64)
-        steps, late = held.shape[1], self._latency
-        if late > 0:
-            before = self._ctrl[ids[order]][:, None].expand(-1, late, -1)
-            held = torch.cat([before, held[:, : steps - late]], 1)
+        steps, late = held.shape[1], self._late[ids[order]]
+        if len(self._arrivals) > 1:
+            # what each physics step sees: the input from before it, `late` physics steps ago
+            held = torch.cat([self._ctrl[ids[order]][:, None], held], 1)
+            seen = (1 + torch.arange(steps) - late[:, None]).clamp(min=0)
+            held = held[torch.arange(len(held))[:, None], seen]
         found = self.batch.rollout(steps, held.numpy(), record=("qpos", "qvel"), ids=ids[order].numpy())
         x = torch.cat([torch.from_numpy(found[part]) for part in ("qpos", "qvel")], 2)
         # a world that the engine gave up repeats its last state, although it moves there
         stuck = (x[:, 1:] == x[:, :-1]).all(2) & (x[:, 1:, self.model.nq :] != 0).any(2)
         x[:, 1:][stuck] = torch.nan
-        if late > 0:
+        if len(self._arrivals) > 1:
             self._ctrl[ids] = controls[:, -1].to(torch.float64)
         return x[order.argsort(), self._substeps - 1 :: self._substeps]
 
