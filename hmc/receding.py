@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hmc.budget import Budget
 from hmc.planner import Plan, Progress, plan, worlds_for
+from hmc.running import Running
 from hmc.sim.base import Sim
 from hmc.start import Vector, make_start
 from hmc.task import Task
@@ -42,10 +43,7 @@ class Receding:
     Attributes:
         k: control steps since the start of the task.
         schedule: incumbent of the next tick; None before the first one: `plan`'s default.
-        mode: the mode now running; None before the first tick.
-        ran: control steps that it has been running.
-        memory: what it remembers, (its memory_size,).
-        u: input applied last, (nu,).
+        running: the mode now running, and its memory.
 
     Args:
         task: what to plan.
@@ -77,10 +75,7 @@ class Receding:
     ):
         self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
         self.sim = sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs))
-        self.mode: int | None = None
-        self.ran: int | None = None
-        self.memory: Tensor | None = None
-        self.u: Tensor | None = None
+        self.running = Running(task.modes)
         self._known: Trace | None = None
         self._plan = partial(
             plan,
@@ -106,26 +101,16 @@ class Receding:
             u: input applied last, (nu,), if it is not the one that the last tick gave.
             snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
         """
-        last = self.u if u is None else u
-        start = make_start(self.task, self.sim, x, last, self.mode, self.memory, self.k, snapshot, self.ran)
+        now = self.running
+        last = now.u if u is None else u
+        start = make_start(self.task, self.sim, x, last, now.mode, now.memory, self.k, snapshot, now.ran)
         first = self._known is None
         known = self._known.since(1) if self._known is not None and len(self._known) > 0 else None
         result = self._plan(
             start, schedule=self.schedule, seed=(self.seed, self.k), forget=first, known=known
         )
         self._known = result.known
-        action = self._run(result.schedule[0], start.x, start.u)
+        action = now.act(result.schedule[0], start.x, start.u, self.k)
         self.schedule = result.schedule.shift()
         self.k += 1
         return Tick(action, result.schedule[0], result)
-
-    def _run(self, mode: int, x: Tensor, u: Tensor) -> Tensor:
-        running = self.task.modes[mode]
-        k = torch.tensor([self.k], device=x.device)
-        memory = None if self.memory is None or mode != self.mode else self.memory[None]
-        self.ran = (self.ran or 0) + 1 if mode == self.mode else 1
-        if memory is None:
-            memory = running.reset(x[None], u[None], k)
-        action, memory = running.act(x[None], u[None], memory, k)
-        self.u, self.memory, self.mode = action[0].to(x.dtype), memory[0].to(x.dtype), mode
-        return self.u.clone()

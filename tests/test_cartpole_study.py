@@ -8,7 +8,7 @@ import pytest
 
 from hmc.cfg import load
 from hmc.sampling import METHODS
-from tools import cartpole, cartpole_study
+from tools import cartpole, cartpole_study, study
 from tools.cartpole_figures import gap, reference
 
 TINY = (
@@ -65,14 +65,14 @@ def test_a_stopped_study_goes_on(cfg, rows, tmp_path, monkeypatch, capsys):
         yield from (next(row for row in rows if row.job == job) for job in todo)
 
     args = cartpole.Args(out=tmp_path, set=TINY)
-    monkeypatch.setattr(cartpole, "run_all", stops)
+    monkeypatch.setattr(study, "run_all", stops)
     assert cartpole.main(args) == 1
     assert "stopped with 3 of" in capsys.readouterr().out
     assert not (tmp_path / "results.csv").exists()
-    monkeypatch.setattr(cartpole, "run_all", ends)
+    monkeypatch.setattr(study, "run_all", ends)
     assert cartpole.main(args) == 0
     assert sorted(map(str, ran)) == sorted(map(str, cartpole_study.jobs(cfg)))
-    assert cartpole.read(tmp_path / "results.csv") == rows
+    assert study.read(tmp_path / "results.csv", cartpole_study.Row) == rows
     assert {"gap.png", "sequence.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
@@ -84,7 +84,7 @@ def test_other_settings_begin_anew(rows, tmp_path, monkeypatch):
         yield next(row for row in rows if row.job == todo[0])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cartpole, "run_all", stops)
+    monkeypatch.setattr(study, "run_all", stops)
     for settings in (TINY, TINY, (*TINY, "rollouts=70")):
         cartpole.main(cartpole.Args(out=tmp_path, set=settings))
     assert todos == [len(rows), len(rows) - 1, len(rows)]

@@ -86,8 +86,8 @@ def test_memory_is_kept_while_the_mode_runs_and_made_anew_on_return():
     loop = Receding(task, schedule=LONG, iterations=0)
     counts = []
     for tick, _, _ in follow(loop, task.make_sim(1), 6):
-        assert loop.memory is not None
-        counts.append(int(loop.memory[0]) if tick.mode == 2 else None)
+        assert loop.running.memory is not None
+        counts.append(int(loop.running.memory[0]) if tick.mode == 2 else None)
     assert counts == [1, 2, None, 1, 2, 3]
 
 
@@ -124,7 +124,7 @@ def test_the_input_applied_last_is_remembered_or_told():
 def test_a_bad_state_stops_the_tick_and_leaves_the_loop_as_it_was():
     loop = Receding(toy_task(8), iterations=0)
     loop.tick(X)
-    kept = (loop.k, loop.schedule, loop.mode)
+    kept = (loop.k, loop.schedule, loop.running.mode)
     with pytest.raises(ValueError, match="got nan at index 1"):
         loop.tick([0.0, float("nan")])
-    assert (loop.k, loop.schedule, loop.mode) == kept
+    assert (loop.k, loop.schedule, loop.running.mode) == kept
