@@ -164,6 +164,7 @@ def plan(
     max_samples: int = 0,
     order: str = "uniform",
     pairs: int = 0,
+    moves: int = 0,
     iterations: int | None = None,
     budget: Budget | None = None,
     tolerance: float = 1e-6,
@@ -199,8 +200,11 @@ def plan(
             0 for N throughout.
         order: of "sample"'s draws: "uniform", as Theorem 2 has it, or "tails": the switches that last to
             the end of the horizon first. Either way each switch comes once.
-        pairs: further draws that "sample" makes beside each batch, of two switches stitched at once (see
-            `Search.look_past`): what no single switch improves, two may. They do not count in `coverage`.
+        pairs: further draws that "sample" makes beside each batch: two switches at once, into a mode and
+            on to a third (`hmc.moves.handovers`). What no single switch improves, two may. They do not
+            count in `coverage`.
+        moves: further draws beside each batch that move a stretch of the schedule, or one of its ends
+            (`hmc.moves.moves`); they do not count either.
         iterations: at most this many switches are accepted; None for as many as improve.
         budget: limits on draws, control steps and seconds.
         tolerance: a switch counts if it lowers the cost by more than this share of it.
@@ -217,8 +221,8 @@ def plan(
     """
     _known("solver", solver, SOLVERS)
     _known("order", order, ORDERS)
-    _check(samples, max_samples, pairs, iterations, tolerance)
-    sim = sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs))
+    _check(samples, max_samples, pairs, moves, iterations, tolerance)
+    sim = sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs + moves))
     if forget:
         for each in task.modes:
             each.forget()
@@ -244,6 +248,7 @@ def plan(
         np.random.default_rng(seed),
         order,
         pairs,
+        moves,
         max_samples,
     )
     if progress is not None:
@@ -259,9 +264,9 @@ def plan(
     return _plan(search, incumbent)
 
 
-def worlds_for(task: Task, samples: int, max_samples: int, pairs: int) -> int:
+def worlds_for(task: Task, samples: int, max_samples: int, beside: int) -> int:
     """Worlds that a batch fits into, with one more for the schedule that is recorded beside it."""
-    return min(max(samples, max_samples, pairs), len(SwitchSpace(len(task.modes), task.horizon))) + 1
+    return min(max(samples, max_samples, beside), len(SwitchSpace(len(task.modes), task.horizon))) + 1
 
 
 def _incumbent(
@@ -313,13 +318,16 @@ def _known(what: str, name: str, names: Mapping[str, object]) -> None:
         raise ValueError(f"unknown {what} {name!r}: expected one of {', '.join(names)}{hint}")
 
 
-def _check(samples: int, max_samples: int, pairs: int, iterations: int | None, tolerance: float) -> None:
+def _check(
+    samples: int, max_samples: int, pairs: int, moves: int, iterations: int | None, tolerance: float
+) -> None:
     if samples < 1:
         raise ValueError(f"samples must be at least 1 switch a batch, got {samples}")
     if max_samples < 0:
         raise ValueError(f"max_samples must be >= 0 switches a batch, got {max_samples}")
-    if pairs < 0:
-        raise ValueError(f"pairs must be >= 0 draws beside each batch, got {pairs}")
+    for name, beside in (("pairs", pairs), ("moves", moves)):
+        if beside < 0:
+            raise ValueError(f"{name} must be >= 0 draws beside each batch, got {beside}")
     if iterations is not None and iterations < 0:
         raise ValueError(f"iterations must be >= 0, or None for no limit, got {iterations}")
     if not 0 <= tolerance < math.inf:

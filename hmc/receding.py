@@ -51,8 +51,8 @@ class Receding:
         seed: of the draws; each tick draws from (seed, k).
         k: control step of the first tick.
         sim: simulator to plan in; made once if left out.
-        solver, samples, max_samples, order, pairs, iterations, budget, tolerance, progress: as in `plan`, for
-            every tick.
+        solver, samples, max_samples, order, pairs, moves, iterations, budget, tolerance, progress: as in
+            `plan`, for every tick.
     """
 
     def __init__(
@@ -68,13 +68,16 @@ class Receding:
         max_samples: int = 0,
         order: str = "uniform",
         pairs: int = 0,
+        moves: int = 0,
         iterations: int | None = None,
         budget: Budget | None = None,
         tolerance: float = 1e-6,
         progress: Progress | None = None,
     ):
         self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
-        self.sim = sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs))
+        self.sim = (
+            sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs + moves))
+        )
         self.running = Running(task.modes)
         self._known: Trace | None = None
         self._plan = partial(
@@ -86,6 +89,7 @@ class Receding:
             max_samples=max_samples,
             order=order,
             pairs=pairs,
+            moves=moves,
             iterations=iterations,
             budget=budget,
             tolerance=tolerance,

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from hmc.budget import Meter
+from hmc.moves import handovers, moves
 from hmc.robust import AnyEvaluator
-from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst, tails
+from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
 
 
 @dataclass
@@ -27,7 +28,8 @@ class Search:
         tolerance: a switch counts only when it lowers the cost by more than this share of it.
         rng: where draws come from.
         order: of the draws, one of ORDERS.
-        pairs: draws beside each batch that stitch two switches at once.
+        pairs: draws beside each batch that hand over by way of a third mode.
+        moves: draws beside each batch that move a stretch of the schedule.
         max_samples: size that batches of one iteration double to; N throughout if that is larger.
         report: told after every batch and accepted switch; False ends the search.
         costs: the incumbent's cost, then the cost after each accepted switch or pair.
@@ -44,6 +46,7 @@ class Search:
     rng: np.random.Generator
     order: str = "uniform"
     pairs: int = 0
+    moves: int = 0
     max_samples: int = 0
     report: Callable[[Search], bool | None] = lambda _: None
     costs: list[float] = field(default_factory=list)
@@ -101,26 +104,25 @@ class Search:
             self._found = tuple(switches), cost
 
     def look_past(self) -> None:
-        """Try switches of a schedule that itself may be worse: a tail, and tails of other modes after it.
-
-        Handing over by way of a third mode takes two switches, of which the first alone need not improve.
-        """
-        position = self.evaluator.start.k + len(self.switches)
-        order = tails(self.space, self.evaluator.start.k, position)
-        first = next((tail for tail in order if tail.duration > 1), None)
-        room, _ = self.meter.room(self.pairs)
-        if first is None or room <= 0:
+        """Try what takes two switches, of which the first alone need not improve: see `hmc.moves`."""
+        k = self.evaluator.start.k
+        room, _ = self.meter.room(self.pairs + self.moves)
+        tried = handovers(self.space, k, k + len(self.switches), min(self.pairs, room))
+        tried += moves(self.schedule, self.rng, min(self.moves, room - len(tried)))
+        if not tried:
             return
-        later = [tail for tail in order if tail.start > first.start and tail.mode != first.mode][:room]
-        if not later:
-            return
-        indices = torch.tensor([self.space.index(tail) for tail in later])
-        schedules = self.space.stitch(self.schedule.stitch(first), indices)
+        schedules = torch.stack([self._stitched(switches).tensor() for switches in tried])
         costs = self._roll(schedules[: self.meter.affordable(schedules)])
-        if len(costs) == 0:
-            return
-        best = costs.nan_to_num(math.inf).argmin()
-        self.offer([first, later[int(best)]], float(costs[best]))
+        if len(costs) > 0:
+            best = int(costs.nan_to_num(math.inf).argmin())
+            self.offer(tried[best], float(costs[best]))
+
+    def _stitched(self, switches: Sequence[Switch]) -> Schedule:
+        """The schedule with switches stitched one after the other."""
+        schedule = self.schedule
+        for switch in switches:
+            schedule = schedule.stitch(switch)
+        return schedule
 
     def _roll(self, schedules: Tensor) -> Tensor:
         """Costs of a batch of draws (n, T), (n,); NaN where the clock cut it short."""
@@ -134,8 +136,7 @@ class Search:
         if self._found is None:
             return False
         switches, cost = self._found
-        for switch in switches:
-            self.schedule = self.schedule.stitch(switch)
+        self.schedule = self._stitched(switches)
         self.switches += switches
         self.costs.append(cost)
         self.seen, self._found = 0, None
@@ -156,8 +157,7 @@ def sample(search: Search) -> None:
     for indices, costs in search.batches(draws):
         best = costs.argmin()
         search.offer([search.space[int(indices[best])]], float(costs[best]))
-        if search.pairs:
-            search.look_past()
+        search.look_past()
         if search.found:
             return
 

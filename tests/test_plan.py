@@ -28,11 +28,19 @@ FAR = [1.5, 1.0]
     seed=st.integers(0, 9),
     order=st.sampled_from(["uniform", "tails"]),
     pairs=st.sampled_from([0, 1, 20]),
+    moves=st.sampled_from([0, 3]),
 )
 @settings(max_examples=40)
-def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, order, pairs):
+def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, order, pairs, moves):
     task = toy_task(5)
-    options = {"solver": solver, "samples": samples, "seed": seed, "order": order, "pairs": pairs}
+    options = {
+        "solver": solver,
+        "samples": samples,
+        "seed": seed,
+        "order": order,
+        "pairs": pairs,
+        "moves": moves,
+    }
     result = plan(task, x, schedule=incumbent, budget=Budget(draws=draws), **options)
     assert result.incumbent.modes == tuple(incumbent)
     assert result.incumbent_cost == slow_cost(task, incumbent, x)
@@ -47,7 +55,7 @@ def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, or
         stitched = stitched.stitch(switch)
     assert stitched == result.schedule
     accepted = len(result.costs) - 1
-    assert accepted <= len(result.switches) <= (2 if pairs else 1) * accepted
+    assert accepted <= len(result.switches) <= (2 if pairs or moves else 1) * accepted
     assert all(b < a for a, b in pairwise(result.costs))
     assert result.space_size == 45
     assert result.draws >= result.rollouts - 1

@@ -21,7 +21,7 @@ from tools.benchmarks.engine import Engine, engine
 from tools.benchmarks.figures import cores, machine
 from tools.benchmarks.planner import Planner, planner
 from tools.benchmarks.train import Train, train
-from tools.flip import write_json
+from tools.study import write_json
 
 
 def main(args: Engine | Train | Planner) -> int:

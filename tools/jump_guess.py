@@ -25,7 +25,7 @@ from hmc.go2.stances import FOOTSTAND, HANDSTAND  # noqa: E402
 from hmc.go2.task import dense_guess, flip_task, make_sim  # noqa: E402
 from hmc.sim.base import Sim  # noqa: E402
 from hmc.task import Task  # noqa: E402
-from tools.flip import RunCfg, disturbed_start  # noqa: E402
+from tools.closed_loop import RunCfg, disturbed_start  # noqa: E402
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from hmc import Evaluator, Schedule, SwitchSpace, Task, make_start  # noqa: E402
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
+from tools.closed_loop import RunCfg  # noqa: E402
 from tools.figures import save  # noqa: E402
-from tools.flip import RunCfg  # noqa: E402
 
 
 @dataclass(frozen=True)

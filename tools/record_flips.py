@@ -22,7 +22,7 @@ from rich.progress import track  # noqa: E402
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, make_sim  # noqa: E402
-from tools.flip import RunCfg  # noqa: E402
+from tools.closed_loop import RunCfg  # noqa: E402
 from tools.jump_guess import settled_stands  # noqa: E402
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -53,7 +54,7 @@ def carry_out(
     work: Callable[[Any], R],
     jobs: Sequence[Any],
     table: Path,
-    kind: type[R],
+    kind: Callable[..., R],
     processes: int,
     console: Console,
 ) -> list[R] | None:
@@ -108,7 +109,7 @@ def run_all(work: Callable[[Any], R], todo: Sequence[Any], processes: int, conso
             raise
 
 
-def read(path: Path, kind: type[R]) -> list[R]:
+def read(path: Path, kind: Callable[..., R]) -> list[R]:
     """The rows of a table."""
     made = get_type_hints(kind)["job"]
 
@@ -129,4 +130,11 @@ def write(path: Path, rows: Sequence[Any]) -> None:
         writer = csv.DictWriter(file, list(lines[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
+    os.replace(partial, path)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write a file that is either whole or not there."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
     os.replace(partial, path)

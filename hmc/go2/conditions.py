@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from hmc.go2.variants import VariantsCfg
+from hmc.go2.model import product
+from hmc.go2.variants import VariantsCfg, draw
+from hmc.sim.mujoco import MujocoSim
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,11 @@ class NoiseCfg:
     def __post_init__(self) -> None:
         if not 0 <= self.lasting <= 1:
             raise ValueError(f"noise.lasting is a share, 0 to 1, got {self.lasting}")
+
+    @classmethod
+    def none(cls) -> NoiseCfg:
+        """No noise at all."""
+        return cls(gravity=0.0, position=0.0, velocity=0.0, gyro=0.0, joint=0.0, joint_speed=0.0)
 
     def widths(self) -> Tensor:
         """Half width of each entry of an observation (48,), see `hmc.go2.observe`."""
@@ -71,3 +78,63 @@ def pushed(x: Tensor, speed: Tensor, direction: Tensor) -> Tensor:
     x[:, 19] += (speed * direction.cos()).to(x)
     x[:, 20] += (speed * direction.sin()).to(x)
     return x
+
+
+class Robot:
+    """One Go2 in the simulator, told apart from what it knows of itself.
+
+    What it measures is noisy and shifted by its zeros; it obeys late, and with its own motors.
+
+    Attributes:
+        variant: which one it is.
+
+    Args:
+        conditions: where it is drawn from; of pushes the caller decides, see `push`.
+        x: true state, (37,).
+        u: last input as commanded, (12,).
+        seed: of the robot and of its noise.
+    """
+
+    def __init__(self, conditions: Conditions, x: Tensor, u: Tensor, seed: int = 0):
+        self._generator = torch.Generator().manual_seed(seed)
+        (self.variant,) = draw(conditions.variants, 1, self._generator)
+        self._noise, self._zeros = conditions.noise, torch.tensor(self.variant.zeros, dtype=torch.float64)
+        self._lasting = self._uniform()
+        self.sim = MujocoSim(self.variant.model(), 1, threads=1, latency=self.variant.late())
+        self.sim.reset(x[None], (u - self._zeros)[None])
+
+    @property
+    def x(self) -> Tensor:
+        """The true state, (37,)."""
+        return self.sim.x()[0]
+
+    @property
+    def u(self) -> Tensor:
+        """The input commanded last, (12,)."""
+        return self.sim.u()[0] + self._zeros
+
+    def estimate(self) -> Tensor:
+        """What it believes its state to be, (37,); each call draws new noise."""
+        share = self._noise.lasting
+        error = self._noise.widths()[:36].double() * (share * self._lasting + (1 - share) * self._uniform())
+        x = self.x
+        turn = torch.cat([x.new_ones(1), error[:3] / 2])
+        x[3:7] = product(x[3:7], turn / turn.norm())
+        x[:3] += error[3:6]
+        x[19:22] += error[6:9]
+        x[22:25] += error[9:12]
+        x[7:19] += error[12:24] + self._zeros
+        x[25:37] += error[24:36]
+        return x
+
+    def step(self, u: Tensor) -> None:
+        """Obey the joint targets u (12,) for a control step."""
+        self.sim.step((u - self._zeros)[None])
+
+    def push(self, speed: float, direction: float) -> None:
+        """Give the base `speed` [m/s] towards `direction` [rad]."""
+        x = pushed(self.sim.x(), torch.tensor([speed]), torch.tensor([direction]))
+        self.sim.reset(x, self.sim.u())
+
+    def _uniform(self) -> Tensor:
+        return 2 * torch.rand(36, generator=self._generator, dtype=torch.float64) - 1

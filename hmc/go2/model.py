@@ -127,6 +127,12 @@ def vertical(quat: Tensor) -> Tensor:
     return _entries(quat, 6)
 
 
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton's product of two quaternions (w, x, y, z) (4,): turn by b, then by a."""
+    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + torch.linalg.cross(a[1:], b[1:])
+    return torch.cat([w[None], v])
+
+
 @cache
 def _sides(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """+1 for left, -1 for right legs; +1 for front, -1 for rear legs, (4,) each."""

@@ -158,7 +158,14 @@ def policy_path(name: str, given: str = "") -> Path:
 
 
 def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> SamplingMpc:
-    """The jump: MPPI towards the handstand, its noise mostly left-right symmetric."""
+    """The jump: MPPI towards the handstand."""
+    return sampling_mode("jump", cfg, make_sim, lambda k: torch.ones_like(k, dtype=torch.bool), seed)
+
+
+def sampling_mode(
+    name: str, cfg: JumpCfg, make_sim: Callable[[int], Sim], hand: Callable[[Tensor], Tensor], seed: int
+) -> SamplingMpc:
+    """Sampling MPC towards the stance that `hand(k)` names, its noise mostly left-right symmetric."""
     symmetric = torch.zeros(4, 12)
     for row, joint in enumerate((1, 2, 7, 8)):
         symmetric[row, [joint, joint + 3]] = 1.0
@@ -167,10 +174,10 @@ def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Sampli
     if cfg.guess:
         guess = dense_guess(torch.tensor(cfg.guess, dtype=torch.float64), cfg.spacing)
     return SamplingMpc(
-        "jump",
+        name,
         cfg.sampling,
         make_sim,
-        stance_cost(cfg.cost, lambda k: torch.ones_like(k, dtype=torch.bool)),
+        stance_cost(cfg.cost, hand),
         go2.Q_LOWER.double(),
         go2.Q_UPPER.double(),
         guess=guess,

@@ -22,7 +22,7 @@ from hmc.modes import ModeSet
 from hmc.sim.ids import Ids, count
 from hmc.sim.mujoco import MujocoSim
 from hmc.tasks.cartpole import CartpoleCfg, ConstantInput, cartpole, initial_state
-from tools import flip
+from tools import closed_loop
 from tools.benchmarks.figures import Common, Figures
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,7 +68,7 @@ def planner(args: Planner) -> Figures:
     )
     _cartpole(figures, args)
 
-    run = load(ROOT / "cfg" / "flip.toml", flip.RunCfg, args.set)
+    run = load(ROOT / "cfg" / "flip.toml", closed_loop.RunCfg, args.set)
     if all(
         policy_path(*names).is_file()
         for names in (("footstand", run.task.foot), ("handstand", run.task.hand))
@@ -106,12 +106,12 @@ def _cartpole(figures: Figures, args: Planner) -> None:
     )
 
 
-def _omega(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
+def _omega(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
     """All of Omega from a foot stand, policies as modes, without and with pruning."""
     task = flip_task(cfg.task, threads=args.threads)
     foot, hand = task.modes["foot"], task.modes["hand"]
     modes = ModeSet([foot, hand, Policy(policy_path("handstand", cfg.task.hand), name="again")])
-    x, u = flip.disturbed_start(cfg.start, 0)
+    x, u = closed_loop.disturbed_start(cfg.start, 0)
     size = len(SwitchSpace(3, args.horizon))
     for name, nonnegative, what in (
         ("shared_fraction", False, "sharing beginnings"),
@@ -128,12 +128,12 @@ def _omega(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
         )
 
 
-def _replan(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
+def _replan(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
     """One MPPI update against the bare engine's rollouts of as many worlds and steps."""
     settings = replace(cfg.task.jump.sampling, samples=30, horizon=40, replan_every=40, worlds=30)
     sim = partial(make_sim, threads=args.threads)
     mpc = jump_mode(replace(cfg.task.jump, sampling=settings), sim, seed=0)
-    x, u = (row[None] for row in flip.disturbed_start(cfg.start, 0))
+    x, u = (row[None] for row in closed_loop.disturbed_start(cfg.start, 0))
     bare = MujocoSim(load_model(), 30, substeps=SUBSTEPS, threads=args.threads)
     held = u.expand(30, -1)[:, None].expand(-1, 40 * SUBSTEPS, -1).contiguous().numpy()
     took: list[list[float]] = [[], []]
@@ -154,21 +154,23 @@ def _replan(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
     )
 
 
-def _ticks(figures: Figures, args: Planner, cfg: flip.RunCfg) -> None:
+def _ticks(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
     """The Go2's closed loop as tools/flip.py runs it, around the moment of the command."""
     task = flip_task(cfg.task, threads=args.threads)
-    world, (x, u) = make_sim(1, threads=args.threads), flip.disturbed_start(cfg.start, 0)
+    world, (x, u) = make_sim(1, threads=args.threads), closed_loop.disturbed_start(cfg.start, 0)
     world.reset(x[None], u[None])
     loop = Receding(
         task,
         schedule=["foot"] * task.horizon,
         k=max(0, cfg.task.command - 5),
-        **flip.search_options(cfg.search),
+        **closed_loop.search_options(cfg.search),
     )
     times, used, naive = [], 0, 0
     for _ in range(args.ticks):
         began = time.perf_counter()
-        tick = loop.tick(world.x()[0], world.u()[0], flip.exact(cfg.task, world))
+        tick = loop.tick(
+            world.x()[0], world.u()[0], world.save()[0] if closed_loop.same_model(cfg.task) else None
+        )
         times.append(1e3 * (time.perf_counter() - began))
         used, naive = used + tick.plan.control_steps, naive + task.horizon * tick.plan.draws
         world.step(tick.u[None])
