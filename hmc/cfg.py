@@ -27,11 +27,11 @@ class CfgError(ValueError):
     """A config that cannot be used; the message says where, what was expected and what came."""
 
 
-def load(path: str | Path, cls: type[T], overrides: Sequence[str] = ()) -> T:
-    """Read a TOML file into the dataclass `cls`; `overrides` as in `override`."""
+def load(path: str | Path, cls: type[T], overrides: Sequence[str] = (), *, table: str = "") -> T:
+    """Read a TOML file, or one table of it, into the dataclass `cls`; `overrides` as in `override`."""
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         here = ", ".join(sorted(p.name for p in path.parent.glob("*.toml"))) or "none"
         raise CfgError(f"{path}: no such file; config files in {path.parent}: {here}") from None
@@ -41,7 +41,10 @@ def load(path: str | Path, cls: type[T], overrides: Sequence[str] = ()) -> T:
         raise CfgError(f"{path}:{line}: not valid TOML: {error}") from None
     except UnicodeDecodeError as error:
         raise CfgError(f"{path}: not a text file in UTF-8: {error}") from None
-    return _build(_set(table, overrides), cls, " with ".join([str(path), *overrides]), "")
+    if table and not isinstance(found.get(table), dict):
+        raise CfgError(f"{path}: has no table [{table}]; it has {', '.join(found) or 'nothing'}")
+    found = found[table] if table else found
+    return _build(_set(found, overrides), cls, " with ".join([str(path), *overrides]), "")
 
 
 def override(cfg: T, items: Sequence[str]) -> T:

@@ -82,6 +82,14 @@ def test_a_table_changes_the_default_key_by_key(file):
     assert load(file, Experiment).warm == Ppo(lr=0.5, epochs=2, clip=0.2)
 
 
+def test_a_table_of_a_file(file):
+    assert load(file, Ppo, table="ppo") == Ppo(lr=1e-4)
+    assert load(file, Ppo, ("epochs=4",), table="ppo") == Ppo(lr=1e-4, epochs=4)
+    for name in ("ppoo", "seed"):
+        with pytest.raises(CfgError, match=rf"has no table \[{name}\]; it has seed, ppo, terms"):
+            load(file, Ppo, table=name)
+
+
 numbers = st.floats(allow_nan=False)
 terms = st.builds(Term, name=st.text(), weight=numbers)
 ppos = st.builds(

@@ -8,14 +8,18 @@ import pytest
 import torch
 
 from hmc.go2 import model as go2
-from hmc.go2.conditions import Conditions, NoiseCfg, pushed
+from hmc.go2.conditions import Conditions, NoiseCfg, Robots, pushed
 from hmc.go2.mirror import mirror_joints, mirror_observation
 from hmc.go2.observe import anchor_of, observe
+from hmc.go2.policy import Policy
 from hmc.go2.stances import HANDSTAND
 from hmc.go2.variants import Variant, VariantsCfg, draw
 from hmc.sim.mujoco import MujocoSim
 from tests.tiny import CFG, make_env, make_runner
+from tools.random_policy import write_random_policy
+from train import evaluate
 from train.env import both_sides
+from train.starts import Starts, StartsCfg
 
 WIDE = VariantsCfg(
     friction=(0.4, 1.2),
@@ -203,6 +207,61 @@ def test_pushes_come_as_often_and_as_hard_as_asked():
     assert 0.2 < kick[hit].norm(dim=1).max() <= 0.5 + 1e-6
     assert not kick[:, 2].any()
     assert torch.equal(env.sim.x().float()[:, 19:22], env._x[:, 19:22]), "the engine is pushed as well"
+
+
+def test_robots_obey_and_measure_with_their_own_zeros():
+    """Told their state as they measure it, and asked to stay there, they stay where they are."""
+    zeros, x = VariantsCfg(zeros=0.01), HANDSTAND.state().repeat(6, 1)
+    x[:, 2] += 1.0
+    shifted = Robots(Conditions(zeros, NoiseCfg.none()), x, x[:, 7:19], seed=1)
+    plain = Robots(Conditions(noise=NoiseCfg.none()), x, x[:, 7:19], seed=1)
+    assert torch.equal(plain.estimate(), x)
+    shift = shifted.estimate() - x
+    assert torch.equal(shift[:, :7], torch.zeros(6, 7).double())
+    assert 0.005 < shift[:, 7:19].abs().max() <= 0.01
+    for _ in range(5):
+        plain.step(x[:, 7:19] + 0.2)
+        shifted.step(x[:, 7:19] + 0.2 + shift[:, 7:19])
+    torch.testing.assert_close(shifted.x, plain.x, atol=1e-9, rtol=1e-9)
+    torch.testing.assert_close(shifted.u, x[:, 7:19] + 0.2 + shift[:, 7:19])
+
+
+def test_estimates_are_off_by_no_more_than_the_noise():
+    noise = NoiseCfg(0.02, 0.03, 0.1, 0.05, 0.004, 0.2, lasting=0.5)
+    x = HANDSTAND.state().repeat(300, 1)
+    robots = Robots(Conditions(noise=noise), x, x[:, 7:19], seed=2)
+    first, second = robots.estimate(), robots.estimate()
+    widths = [0.03] * 3 + [0.004] * 12 + [0.1] * 3 + [0.05] * 3 + [0.2] * 12
+    for found in (first, second):
+        error = (found - x)[:, [*range(3), *range(7, 37)]].abs().amax(0)
+        assert (error <= torch.tensor(widths) + 1e-12).all()
+        assert (error > 0.8 * torch.tensor(widths)).all()
+        tilt = (found[:, 3:7] * x[:, 3:7]).sum(1).clamp(max=1).acos() * 2
+        assert 0.02 < tilt.max() < 0.02 * 3**0.5
+        torch.testing.assert_close(found[:, 3:7].norm(dim=1), torch.ones(300).double())
+    assert (second - first)[:, 0].abs().max() < 0.03, "half of it lasts"
+    again = Robots(Conditions(noise=noise), x, x[:, 7:19], seed=2)
+    assert torch.equal(again.estimate(), first)
+
+
+def test_a_policy_is_measured_under_its_conditions(tmp_path, monkeypatch):
+    """Episodes are alike until the push, and not after it."""
+    policy = Policy(write_random_policy(tmp_path / "random.onnx", hidden=(4,)))
+    starts = Starts(HANDSTAND, StartsCfg(stance=1.0, home=0.0), torch.device("cpu"), unlocked=True)
+    monkeypatch.setattr(evaluate, "SETTLE", 0.1)
+    seen: dict[float, list[torch.Tensor]] = {0.0: [], 0.4: []}
+    for speed, states in seen.items():
+        torch.manual_seed(3)
+        step = Robots.step
+        monkeypatch.setattr(Robots, "step", lambda self, u: (step(self, u), states.append(self.x))[0])  # noqa: B023
+        conditions = Conditions(noise=NoiseCfg.none(), push=speed)
+        good, found = evaluate.measured(policy, starts, "push", 5, conditions, 1)
+        monkeypatch.setattr(Robots, "step", step)
+        assert good.shape == (5,)
+        assert found.held.shape == (5 + round(5.0 / go2.DT), 5)
+    gap = [(a - b).norm(dim=1) for a, b in zip(*seen.values(), strict=True)]
+    assert not torch.stack(gap[:5]).any()
+    assert (gap[5] > 0.2).all()
 
 
 def test_a_push():

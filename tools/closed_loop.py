@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hmc import Budget, ModeSet, Receding, Task
 from hmc.cost import Cost
-from hmc.go2.conditions import Conditions, NoiseCfg, Robot
+from hmc.go2.conditions import Conditions, NoiseCfg, Robots
 from hmc.go2.model import SUBSTEPS, product
 from hmc.go2.observe import pitch
 from hmc.go2.stages import Stages, judge
@@ -142,7 +142,7 @@ def disturbed_start(cfg: StartCfg, seed: int) -> tuple[Tensor, Tensor]:
     x[25:37] += noise(12, cfg.joint_speed)
     roll, tilt = noise(2, cfg.tilt / 2)  # half angles
     turn = torch.stack([torch.ones_like(roll), roll, tilt, torch.zeros_like(roll)])
-    x[3:7] = product(x[3:7], turn / turn.norm())
+    x[3:7] = product(x[None, 3:7], turn[None] / turn.norm())[0]
     return x, x[7:19].clone()
 
 
@@ -220,21 +220,23 @@ def run(
         pushes: control step -> speed [m/s] and direction [rad] of a push before it.
         progress: called after every step.
     """
-    robot = Robot(conditions, *disturbed_start(cfg.start, seed), seed=seed)
+    x, u = disturbed_start(cfg.start, seed)
+    robot = Robots(conditions, x[None], u[None], seed=seed)
     exact = conditions == MODEL and same_model(cfg.task)
-    xs, modes, log, terms = [robot.x], [], [], []
+    xs, modes, log, terms = [x], [], [], []
     dt = robot.sim.dt
     for k in range(round(cfg.seconds / dt)):
         if pushes is not None and k in pushes:
-            robot.push(*pushes[k])
-        x, u_prev = robot.x, robot.u
-        believed = x if conditions == MODEL else robot.estimate()
+            speed, direction = pushes[k]
+            robot.push(torch.tensor([speed]), torch.tensor([direction]))
+        x, u_prev = robot.x[0], robot.u[0]
+        believed = x if conditions == MODEL else robot.estimate()[0]
         began = time.perf_counter()
         u, mode, notes = control(believed, u_prev, robot.sim.save()[0] if exact else None)
         elapsed = 1e3 * (time.perf_counter() - began)
         stage = cost.stage_terms(x[None], u[None], u_prev[None], torch.tensor([k]))[0] * dt
-        robot.step(u)
-        xs.append(robot.x)
+        robot.step(u[None])
+        xs.append(robot.x[0])
         modes.append(mode)
         terms.append(stage)
         log.append(

@@ -16,16 +16,16 @@ import torch  # noqa: E402
 import tyro  # noqa: E402
 from torch import Tensor  # noqa: E402
 
+from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
-from hmc.go2.model import load_model  # noqa: E402
+from hmc.go2.conditions import Conditions, NoiseCfg, Robots  # noqa: E402
 from hmc.go2.policy import Policy  # noqa: E402
 from hmc.go2.stances import STANCES, Stance  # noqa: E402
-from hmc.sim.base import Sim  # noqa: E402
-from hmc.sim.mujoco import MujocoSim  # noqa: E402
 from train.starts import Starts, StartsCfg  # noqa: E402
 
 # name -> (time to reach the stance, time to hold it from then on) [s]
-PROTOCOLS = {"stance": (0.5, 9.5), "home": (3.0, 5.0), "recorded": (3.0, 5.0)}
+PROTOCOLS = {"stance": (0.5, 9.5), "push": (2.0, 3.0), "home": (3.0, 5.0), "recorded": (3.0, 5.0)}
+SETTLE = 1.0  # s in the stance before a push
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,46 @@ class Score:
         return f"{self.success} of {self.episodes} ({self.rate:.1%}; 95 % interval {low:.1%} to {high:.1%})"
 
 
-def held_over_time(sim: Sim, policy: Policy, stance: Stance, x: Tensor, u: Tensor, steps: int) -> Tensor:
-    """Whether the stance is held after each step under the policy, (steps, n) bool."""
-    sim.reset(x, u)
-    k = torch.zeros(len(x), dtype=torch.long)
-    memory = policy.reset(sim.x(), sim.u(), k)
-    held = []
+@dataclass(frozen=True)
+class Held:
+    """A batch of episodes.
+
+    Attributes:
+        held: whether the stance is held after each step, (steps, n) bool.
+        power: sum of |torque x speed| over the joints, mean of all steps in which it is held [W].
+        rate: change of the joint targets from step to step, root mean square of them likewise [rad].
+    """
+
+    held: Tensor
+    power: float
+    rate: float
+
+
+def held_over_time(robots: Robots, policy: Policy, stance: Stance, steps: int, push: Tensor) -> Held:
+    """Run the policy on what the robots believe.
+
+    Args:
+        robots: n of them.
+        policy: to be run.
+        stance: to be held.
+        steps: control steps.
+        push: what all get after `SETTLE`: speed [m/s] and direction [rad], (2, n).
+    """
+    k = torch.zeros(len(push[0]), dtype=torch.long)
+    u = robots.u
+    memory = policy.reset(robots.estimate(), u, k)
+    held, power, rate = [], [], []
     for step in range(steps):
-        action, memory = policy.act(sim.x(), sim.u(), memory, k + step)
-        sim.step(action)
-        held.append(stance.held(sim.x()))
-    return torch.stack(held)
+        if step == round(SETTLE / robots.sim.dt) and bool((push[0] > 0).any()):
+            robots.push(*push)
+        action, memory = policy.act(robots.estimate(), u, memory, k + step)
+        robots.step(action)
+        x = robots.x
+        held.append(stance.held(x))
+        power.append((robots.sim.actuator_force() * x[:, 25:37]).abs().sum(1)[held[-1]])
+        rate.append((action - u).square().mean(1)[held[-1]])
+        u = action
+    return Held(torch.stack(held), float(torch.cat(power).mean()), float(torch.cat(rate).mean().sqrt()))
 
 
 def reached_and_kept(held: Tensor, reach: int, keep: int) -> Tensor:
@@ -77,13 +106,19 @@ def reached_and_kept(held: Tensor, reach: int, keep: int) -> Tensor:
 
 
 @torch.no_grad()
-def succeeded(policy: Policy, starts: Starts, protocol: str, episodes: int, threads: int) -> Tensor:
-    """Which of `episodes` are successes under one of PROTOCOLS, (episodes,) bool."""
+def measured(
+    policy: Policy, starts: Starts, protocol: str, episodes: int, conditions: Conditions, threads: int
+) -> tuple[Tensor, Held]:
+    """Which of `episodes` are successes under one of PROTOCOLS, (episodes,) bool, and what was measured."""
     start = starts.sample(episodes)
-    sim = MujocoSim(load_model(), episodes, threads=threads)
-    reach, keep = (round(seconds / sim.dt) for seconds in PROTOCOLS[protocol])
-    held = held_over_time(sim, policy, starts.stance, start.x, start.u, reach + keep)
-    return reached_and_kept(held, reach, keep)
+    robots = Robots(conditions, start.x, start.u, seed=int(torch.randint(2**31, ())), threads=threads)
+    reach, keep = (round(seconds / robots.sim.dt) for seconds in PROTOCOLS[protocol])
+    push, before = torch.zeros(2, episodes), 0
+    if protocol == "push":
+        before = round(SETTLE / robots.sim.dt)
+        push = torch.stack([torch.full((episodes,), conditions.push), 2 * math.pi * torch.rand(episodes)])
+    found = held_over_time(robots, policy, starts.stance, before + reach + keep, push)
+    return reached_and_kept(found.held[before:], reach, keep), found
 
 
 def by_moment(good: Tensor, after: Tensor) -> dict[int, Score]:
@@ -106,8 +141,11 @@ class Args:
 
     Attributes:
         policy: ONNX file.
-        starts: stance: the disturbed stance, to be held for 10 s; home: the four-legged stand, stance
-            reached within 3 s and held 5 s; recorded: states of --records, likewise.
+        starts: stance: the disturbed stance, to be held for 10 s; push: likewise, pushed after 1 s, held
+            again within 2 s and for 3 s; home: the four-legged stand, stance reached within 3 s and held
+            5 s; recorded: states of --records, likewise.
+        conditions: a file with a table of this name, such as cfg/robustness.toml: other robots, noise, the
+            speed of pushes; by default the model itself, and pushes of 0.5 m/s.
         episodes: number of episodes.
         seed: of the starts.
         records: file of recorded states, as tools/record_flips.py writes it, one an episode.
@@ -116,7 +154,8 @@ class Args:
     """
 
     policy: tyro.conf.Positional[Path]
-    starts: Literal["stance", "home", "recorded"] = "stance"
+    starts: Literal["stance", "push", "home", "recorded"] = "stance"
+    conditions: Path | None = None
     episodes: int = 500
     seed: int = 1000
     records: Path | None = None
@@ -127,7 +166,8 @@ class Args:
 def set_up(args: Args) -> tuple[Policy, Starts]:
     """The policy and the states it begins from."""
     policy = Policy(args.policy)
-    shares = {"stance": 0.0, "way": 0.0, "home": 0.0, "recorded": 0.0, args.starts: 1.0}
+    shares = {"stance": 0.0, "way": 0.0, "home": 0.0, "recorded": 0.0}
+    shares["stance" if args.starts == "push" else args.starts] = 1.0
     cfg = StartsCfg(**shares, records=str(args.records.resolve()) if args.records else "")
     starts = Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
     if args.starts == "recorded" and starts.records is not None and len(starts.records["x"]) < args.episodes:
@@ -138,21 +178,33 @@ def set_up(args: Args) -> tuple[Policy, Starts]:
     return policy, starts
 
 
+def conditions_of(path: Path | None) -> Conditions:
+    """Those of a file, whose other tables are somebody else's; by default the model itself."""
+    if path is None:
+        return Conditions(noise=NoiseCfg.none(), push=0.5)
+    return load(path, Conditions, table="conditions")
+
+
 def main(args: Args) -> None:
     """Measure and print."""
     torch.manual_seed(args.seed)
     with one_line_errors():
         policy, starts = set_up(args)
-    good = succeeded(policy, starts, args.starts, args.episodes, args.threads)
+        conditions = conditions_of(args.conditions)
+    good, found = measured(policy, starts, args.starts, args.episodes, conditions, args.threads)
     result = Score(int(good.sum()), args.episodes)
     reach, keep = PROTOCOLS[args.starts]
     print(f"{policy.metadata['mode']} from {args.starts}: within {reach} s and held {keep} s: {result}")
+    print(
+        f"  while held: joint power {found.power:.1f} W, targets change by {found.rate:.3f} rad a step (rms)"
+    )
     if args.starts == "recorded" and starts.records is not None and "after" in starts.records:
         for moment, part in by_moment(good, starts.records["after"]).items():
             print(f"  after {moment} steps of the jump: {part}")
     if args.json is not None:
         low, high = result.interval
         data = {"success": result.success, "episodes": result.episodes, "low": low, "high": high}
+        data |= {"power": found.power, "rate": found.rate}
         args.json.write_text(json.dumps(data) + "\n", encoding="utf-8")
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from hmc.go2.model import product
+from hmc.go2.model import load_model, product
 from hmc.go2.variants import VariantsCfg, draw
 from hmc.sim.mujoco import MujocoSim
 
@@ -80,61 +80,69 @@ def pushed(x: Tensor, speed: Tensor, direction: Tensor) -> Tensor:
     return x
 
 
-class Robot:
-    """One Go2 in the simulator, told apart from what it knows of itself.
+class Robots:
+    """n Go2s in the simulator, told apart from what they know of themselves.
 
-    What it measures is noisy and shifted by its zeros; it obeys late, and with its own motors.
+    What one measures is noisy and shifted by its zeros; it obeys late, and with its own motors.
 
     Attributes:
-        variant: which one it is.
+        variants: which they are.
+        sim: where they are, a world each; the targets there are what the motors make of the commanded ones.
 
     Args:
-        conditions: where it is drawn from; of pushes the caller decides, see `push`.
-        x: true state, (37,).
-        u: last input as commanded, (12,).
-        seed: of the robot and of its noise.
+        conditions: where they are drawn from; of pushes the caller decides, see `push`.
+        x: true states, (n, 37).
+        u: last inputs as commanded, (n, 12).
+        seed: of the robots and of their noise.
+        threads: of the engine; 0 for all cores.
     """
 
-    def __init__(self, conditions: Conditions, x: Tensor, u: Tensor, seed: int = 0):
+    def __init__(self, conditions: Conditions, x: Tensor, u: Tensor, *, seed: int = 0, threads: int = 1):
+        n = len(x)
         self._generator = torch.Generator().manual_seed(seed)
-        (self.variant,) = draw(conditions.variants, 1, self._generator)
-        self._noise, self._zeros = conditions.noise, torch.tensor(self.variant.zeros, dtype=torch.float64)
-        self._lasting = self._uniform()
-        self.sim = MujocoSim(self.variant.model(), 1, threads=1, latency=self.variant.late())
-        self.sim.reset(x[None], (u - self._zeros)[None])
+        self.variants = draw(conditions.variants, n, self._generator)
+        self._zeros = torch.tensor([each.zeros for each in self.variants], dtype=torch.float64)
+        self._widths, self._share = conditions.noise.widths()[:36].double(), conditions.noise.lasting
+        self._lasting = self._uniform(n)
+        self.sim = MujocoSim(
+            load_model(),
+            n,
+            threads=threads,
+            latency=[each.late() for each in self.variants],
+            models=None if conditions.variants.nominal else [each.model() for each in self.variants],
+        )
+        self.sim.reset(x, u - self._zeros)
 
     @property
     def x(self) -> Tensor:
-        """The true state, (37,)."""
-        return self.sim.x()[0]
+        """True states, (n, 37)."""
+        return self.sim.x()
 
     @property
     def u(self) -> Tensor:
-        """The input commanded last, (12,)."""
-        return self.sim.u()[0] + self._zeros
+        """Inputs commanded last, (n, 12)."""
+        return self.sim.u() + self._zeros
 
     def estimate(self) -> Tensor:
-        """What it believes its state to be, (37,); each call draws new noise."""
-        share = self._noise.lasting
-        error = self._noise.widths()[:36].double() * (share * self._lasting + (1 - share) * self._uniform())
+        """What they believe their states to be, (n, 37); each call draws new noise."""
         x = self.x
-        turn = torch.cat([x.new_ones(1), error[:3] / 2])
-        x[3:7] = product(x[3:7], turn / turn.norm())
-        x[:3] += error[3:6]
-        x[19:22] += error[6:9]
-        x[22:25] += error[9:12]
-        x[7:19] += error[12:24] + self._zeros
-        x[25:37] += error[24:36]
+        error = self._widths * (self._share * self._lasting + (1 - self._share) * self._uniform(len(x)))
+        turn = torch.cat([x.new_ones(len(x), 1), error[:, :3] / 2], 1)
+        x[:, 3:7] = product(x[:, 3:7], turn / turn.norm(dim=1, keepdim=True))
+        x[:, :3] += error[:, 3:6]
+        x[:, 19:22] += error[:, 6:9]
+        x[:, 22:25] += error[:, 9:12]
+        x[:, 7:19] += error[:, 12:24] + self._zeros
+        x[:, 25:37] += error[:, 24:36]
         return x
 
     def step(self, u: Tensor) -> None:
-        """Obey the joint targets u (12,) for a control step."""
-        self.sim.step((u - self._zeros)[None])
+        """Obey the joint targets u (n, 12) for a control step."""
+        self.sim.step(u - self._zeros)
 
-    def push(self, speed: float, direction: float) -> None:
-        """Give the base `speed` [m/s] towards `direction` [rad]."""
-        x = pushed(self.sim.x(), torch.tensor([speed]), torch.tensor([direction]))
-        self.sim.reset(x, self.sim.u())
+    def push(self, speed: Tensor, direction: Tensor) -> None:
+        """Give the bases `speed` [m/s] towards `direction` [rad], (n,) each."""
+        self.sim.reset(pushed(self.sim.x(), speed, direction), self.sim.u())
 
-    def _uniform(self) -> Tensor:
-        return 2 * torch.rand(36, generator=self._generator, dtype=torch.float64) - 1
+    def _uniform(self, n: int) -> Tensor:
+        return 2 * torch.rand(n, 36, generator=self._generator, dtype=torch.float64) - 1

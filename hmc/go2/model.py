@@ -128,9 +128,10 @@ def vertical(quat: Tensor) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton's product of two quaternions (w, x, y, z) (4,): turn by b, then by a."""
-    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + torch.linalg.cross(a[1:], b[1:])
-    return torch.cat([w[None], v])
+    """Hamilton's product of quaternions (w, x, y, z), (n, 4): turn by b, then by a."""
+    aw, av, bw, bv = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    w = aw * bw - (av * bv).sum(1, keepdim=True)
+    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], 1)
 
 
 @cache
