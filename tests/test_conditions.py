@@ -253,7 +253,12 @@ def test_a_policy_is_measured_under_its_conditions(tmp_path, monkeypatch):
     for speed, states in seen.items():
         torch.manual_seed(3)
         step = Robots.step
-        monkeypatch.setattr(Robots, "step", lambda self, u: (step(self, u), states.append(self.x))[0])  # noqa: B023
+
+        def watched(self, u, step=step, states=states):
+            step(self, u)
+            states.append(self.x)
+
+        monkeypatch.setattr(Robots, "step", watched)
         conditions = Conditions(noise=NoiseCfg.none(), push=speed)
         good, found = evaluate.measured(policy, starts, "push", 5, conditions, 1)
         monkeypatch.setattr(Robots, "step", step)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hmc import Budget, ModeSet, Receding, Task
+from hmc.cfg import load
 from hmc.cost import Cost
 from hmc.go2.conditions import Conditions, NoiseCfg, Robots
 from hmc.go2.model import SUBSTEPS, product
@@ -196,6 +198,20 @@ def search_options(cfg: SearchCfg) -> dict[str, Any]:
 def same_model(cfg: FlipCfg) -> bool:
     """Whether the planner's model is the nominal robot's own, so that a snapshot means the same in both."""
     return cfg.substeps == SUBSTEPS and cfg.iterations is None
+
+
+S = TypeVar("S")
+
+
+def study_cfg(path: Path, kind: type[S], items: tuple[str, ...]) -> S:
+    """A study's file with the flip of the flip.toml beside it as its `flip`.
+
+    Overrides that begin with ``flip.`` are the latter's.
+    """
+    own = tuple(item for item in items if not item.startswith("flip."))
+    flip = tuple(item.removeprefix("flip.") for item in items if item.startswith("flip."))
+    found: Any = load(path, kind, own)
+    return cast(S, replace(found, flip=load(path.with_name("flip.toml"), RunCfg, flip)))
 
 
 @torch.no_grad()

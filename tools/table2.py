@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,10 @@ import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
 from tools import study, table2_figures  # noqa: E402
-from tools.closed_loop import RunCfg  # noqa: E402
+from tools.closed_loop import study_cfg  # noqa: E402
 from tools.table2_study import (  # noqa: E402
     CONTROLLERS,
     Row,
@@ -42,14 +41,6 @@ COLUMNS = (
     *("controller", "foot stand", "jump flip", "handstand", "cost, mean", "spread"),
     *("control steps a tick", "time a tick [ms]"),
 )
-
-
-def settings(items: tuple[str, ...]) -> Table2Cfg:
-    """cfg/table2.toml with the flip of cfg/flip.toml; overrides that begin with `flip.` are the latter's."""
-    own = tuple(item for item in items if not item.startswith("flip."))
-    flip = tuple(item.removeprefix("flip.") for item in items if item.startswith("flip."))
-    cfg = load(ROOT / "cfg" / "table2.toml", Table2Cfg, own)
-    return replace(cfg, flip=load(ROOT / "cfg" / "flip.toml", RunCfg, flip))
 
 
 def tuned(cfg: Table2Cfg, path: Path, console: Console) -> dict[str, Rule]:
@@ -118,7 +109,7 @@ def main(args: Args) -> int:
     """Run what is missing; write tables and figures."""
     console = Console()
     with one_line_errors():
-        cfg = settings(args.set)
+        cfg = study_cfg(ROOT / "cfg" / "table2.toml", Table2Cfg, args.set)
         flip_task(cfg.flip.task)  # what is wrong with a policy file shows here
         folder = study.folder_of(args.out, cfg)
     (folder / "runs").mkdir(exist_ok=True)

@@ -21,36 +21,12 @@ from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.conditions import Conditions, NoiseCfg, Robots  # noqa: E402
 from hmc.go2.policy import Policy  # noqa: E402
 from hmc.go2.stances import STANCES, Stance  # noqa: E402
+from tools.wilson import Score  # noqa: E402
 from train.starts import Starts, StartsCfg  # noqa: E402
 
 # name -> (time to reach the stance, time to hold it from then on) [s]
 PROTOCOLS = {"stance": (0.5, 9.5), "push": (2.0, 3.0), "home": (3.0, 5.0), "recorded": (3.0, 5.0)}
 SETTLE = 1.0  # s in the stance before a push
-
-
-@dataclass(frozen=True)
-class Score:
-    """Successes of a number of episodes, with the 95 % Wilson interval of the rate."""
-
-    success: int
-    episodes: int
-
-    @property
-    def rate(self) -> float:
-        """Share of episodes that succeeded."""
-        return self.success / self.episodes
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval (Wilson 1927)."""
-        n, p, z = self.episodes, self.rate, 1.959964
-        middle = (p + z * z / (2 * n)) / (1 + z * z / n)
-        half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-        return middle - half, middle + half
-
-    def __str__(self) -> str:
-        low, high = self.interval
-        return f"{self.success} of {self.episodes} ({self.rate:.1%}; 95 % interval {low:.1%} to {high:.1%})"
 
 
 @dataclass(frozen=True)

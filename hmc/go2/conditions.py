@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from torch import Tensor
@@ -42,6 +42,11 @@ class NoiseCfg:
     def none(cls) -> NoiseCfg:
         """No noise at all."""
         return cls(gravity=0.0, position=0.0, velocity=0.0, gyro=0.0, joint=0.0, joint_speed=0.0)
+
+    def scaled(self, by: float) -> NoiseCfg:
+        """So many times the noise."""
+        parts = {each.name: by * getattr(self, each.name) for each in fields(self) if each.name != "lasting"}
+        return replace(self, **parts)
 
     def widths(self) -> Tensor:
         """Half width of each entry of an observation (48,), see `hmc.go2.observe`."""
