@@ -49,9 +49,10 @@ def _octets(first: int, stride: int, mode: int) -> Ints:
     return np.where(JOINT_ORDER == 0, mode, first + stride * JOINT_ORDER)
 
 
-_COMMAND_NUMBERS = _numbers(7, 9, [0, 1, 2, 3, 4])  # q, dq, tau, kp, kd
+# Words that hold numbers of a command or a state, in the order of their fields.
+COMMAND_NUMBERS = _numbers(7, 9, [0, 1, 2, 3, 4])  # q, dq, tau, kp, kd
 _COMMAND_OCTETS = _octets(24, 36, _COMMAND_MODE)
-_STATE_NUMBERS = np.concatenate([7 + np.arange(13), _numbers(21, 12, [0, 1, 3])])  # IMU; q, dq, tau
+STATE_NUMBERS = np.concatenate([7 + np.arange(13), _numbers(21, 12, [0, 1, 3])])  # IMU; q, dq, tau
 _STATE_OCTETS = np.concatenate([_octets(80, 48, _STATE_MODE), 112 + 48 * JOINT_ORDER])  # and temperatures
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian
@@ -111,9 +112,9 @@ class RobotState(NamedTuple):
 def encode_command(command: MotorCommand, level_flag: int = LOW_LEVEL) -> bytes:
     """The LowCmd frame of a command, (812); motors beyond the twelfth are off."""
     frame = _frame(COMMAND_SIZE, level_flag)
-    np.frombuffer(frame, "<f4")[_COMMAND_NUMBERS] = np.concatenate(command[:5])
+    np.frombuffer(frame, "<f4")[COMMAND_NUMBERS] = np.concatenate(command[:5])
     np.frombuffer(frame, np.uint8)[_COMMAND_OCTETS] = command.mode
-    return _seal(frame, _COMMAND_MODE)
+    return seal(frame)
 
 
 def decode_command(frame: bytes) -> CommandFrame:
@@ -124,7 +125,7 @@ def decode_command(frame: bytes) -> CommandFrame:
     """
     _check(frame, COMMAND_SIZE, "LowCmd")
     head, level_flag = _HEADER.unpack_from(frame, 4)
-    q, dq, tau, kp, kd = _take(frame, _COMMAND_NUMBERS).reshape(5, JOINTS)
+    q, dq, tau, kp, kd = _take(frame, COMMAND_NUMBERS).reshape(5, JOINTS)
     mode = np.frombuffer(frame, np.uint8).take(_COMMAND_OCTETS).astype(np.int64)
     motors = MotorCommand(q, dq, tau, kp, kd, mode)
     return CommandFrame(motors, head, level_flag, _intact(frame, _COMMAND_MODE))
@@ -133,12 +134,12 @@ def decode_command(frame: bytes) -> CommandFrame:
 def encode_state(state: RobotState) -> bytes:
     """The LowState frame of a state, (1180)."""
     frame = _frame(STATE_SIZE, LOW_LEVEL)
-    np.frombuffer(frame, "<f4")[_STATE_NUMBERS] = np.concatenate(state[1:8])
+    np.frombuffer(frame, "<f4")[STATE_NUMBERS] = np.concatenate(state[1:8])
     np.frombuffer(frame, np.uint8)[_STATE_OCTETS] = np.concatenate([state.mode, state.temperature])
     force = state.foot_force.take(FOOT_ORDER).tolist()
     supply = (state.charge, state.current)
     _TAIL.pack_into(frame, _TAIL_AT, *supply, *force, state.tick, state.remote, state.voltage)
-    return _seal(frame, _STATE_MODE)
+    return seal(frame)
 
 
 def decode_state(frame: bytes) -> RobotState:
@@ -148,7 +149,7 @@ def decode_state(frame: bytes) -> RobotState:
         FrameError: not a LowState frame at all.
     """
     _check(frame, STATE_SIZE, "LowState")
-    numbers = _take(frame, _STATE_NUMBERS)
+    numbers = _take(frame, STATE_NUMBERS)
     octets = np.frombuffer(frame, np.uint8).take(_STATE_OCTETS).astype(np.int64)
     charge, current, fr, fl, rr, rl, tick, remote, voltage = _TAIL.unpack_from(frame, _TAIL_AT)
     return RobotState(
@@ -203,8 +204,9 @@ def _words(frame: bytes | bytearray, mode: int) -> bytes:
     )
 
 
-def _seal(frame: bytearray, mode: int) -> bytes:
-    """The frame with its checksum."""
+def seal(frame: bytearray) -> bytes:
+    """A frame of either message with its checksum."""
+    mode = _COMMAND_MODE if len(frame) == COMMAND_SIZE else _STATE_MODE
     frame[-4:] = crc32(_words(frame, mode)).to_bytes(4, "little")
     return bytes(frame)
 
