@@ -15,10 +15,13 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
 
+from cyclonedds.idl import make_idl_struct
+from cyclonedds.idl.types import uint8
+
 from deploy import codec
 from deploy.codec import FrameError, decode_command, decode_state, encode_command, encode_state
 from deploy.crc import crc32
-from deploy.messages import LowCmd_, LowState_
+from deploy.messages import LowCmd_, LowState_, Request_, Response_
 from deploy.remote import Button, Remote, pack, unpack
 from tests import wire
 
@@ -112,6 +115,21 @@ def test_reads_what_dds_serialises() -> None:
     command.motor_cmd[15].q = 0.5
     command.crc = wire.checksum(bytes(wire.to_struct(command, wire.LowCmd()))[:-4])
     assert decode_command(command.serialize(use_version_2=False)).crc_ok
+
+
+TK_BYTE, TK_UINT8 = 2, 13  # kinds of XTypes; Cyclone DDS 0.10 dies of the second
+
+
+@pytest.mark.parametrize("message", [LowCmd_, LowState_, Request_, Response_], ids=lambda it: it.__name__)
+def test_octets_are_announced_as_bytes(message: type) -> None:
+    announced = str(message.__idl__.get_type_mapping())
+    assert f"TypeIdentifier[Union]({TK_BYTE}, None)" in announced
+    assert f"TypeIdentifier[Union]({TK_UINT8}, None)" not in announced
+
+
+def test_that_would_show_the_fatal_type() -> None:
+    fatal = make_idl_struct("Fatal", "Fatal", {"octet": uint8})
+    assert f"TypeIdentifier[Union]({TK_UINT8}, None)" in str(fatal.__idl__.get_type_mapping())
 
 
 def test_sentinels_survive() -> None:

@@ -29,6 +29,11 @@ class Faults:
     corrupt: float = 0.0
     nan: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} of frames must be 0 to 1, got {value}")
+
 
 class Way:
     """A way of frames in one direction.
@@ -43,6 +48,7 @@ class Way:
     def __init__(self, faults: Faults, delay: int, step: float, rng: np.random.Generator):
         self.faults = faults
         self._delay, self._step, self._rng = delay, step, rng
+        (self._damage,) = rng.spawn(1)
         self._now = 0
         self._going: list[tuple[int, bytes]] = []
 
@@ -70,12 +76,12 @@ class Way:
 
     def _corrupted(self, frame: bytes) -> bytes:
         octets = bytearray(frame)
-        for at in self._rng.integers(4, len(octets), 3):
-            octets[at] ^= int(self._rng.integers(1, 256))
+        for at in self._damage.integers(4, len(octets), 3):
+            octets[at] ^= int(self._damage.integers(1, 256))
         return bytes(octets)
 
     def _not_a_number(self, frame: bytes) -> bytes:
         octets = bytearray(frame)
         words = COMMAND_NUMBERS if len(octets) == COMMAND_SIZE else STATE_NUMBERS
-        np.frombuffer(octets, "<f4")[self._rng.choice(words)] = np.nan
+        np.frombuffer(octets, "<f4")[self._damage.choice(words)] = np.nan
         return seal(octets)

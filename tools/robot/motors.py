@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
 
 import numpy as np
 
@@ -69,12 +70,21 @@ class Motors:
         self.torque = np.zeros(len(JOINTS))
         self.temperature = np.full(len(JOINTS), self.AMBIENT)
 
-    def lose(self, names: Iterable[str]) -> None:
-        """Break these joints' motors, and mend all others."""
-        lost = set(names)
-        if unknown := lost - set(JOINTS):
-            raise ValueError(f"no joint {', '.join(sorted(unknown))}: there are {', '.join(JOINTS)}")
-        self.strength = np.array([float(name not in lost) for name in JOINTS])
+    def weaken(self, parts: Mapping[str, float]) -> None:
+        """Let only a part of the torque out of these joints' motors, all of it out of the others'.
+
+        Args:
+            parts: from joint names, or patterns such as "FL_*", to 0 (a lost motor) .. 1; later ones win.
+        """
+        strength = np.ones(len(JOINTS))
+        for pattern, part in parts.items():
+            chosen = [fnmatchcase(joint, pattern) for joint in JOINTS]
+            if not any(chosen):
+                raise ValueError(f"no joint is like {pattern!r}: there are {', '.join(JOINTS)}")
+            if not 0 <= part <= 1:
+                raise ValueError(f"strength of {pattern} must be 0 to 1, got {part}")
+            strength[chosen] = part
+        self.strength = strength
 
     def drive(self, command: MotorCommand, q: Floats, dq: Floats) -> Floats:
         """Torque at the joints [N m], (12,); arguments as in `servo`."""

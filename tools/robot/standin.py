@@ -39,6 +39,7 @@ DAMPING = 3.0  # N m s/rad, of a robot that is told nothing
 LYING = np.array([0.0, 1.36, -2.65] * 4)  # rad, on its belly with folded legs
 
 Start = Literal["lying", "standing", "footstand"]
+Loss = Literal["hold", "damp", "limp"]
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Settings:
     strict: bool = True
     state_delay: float = 0.0
     command_delay: float = 0.002
-    loss: Literal["hold", "damp", "limp"] = "hold"
+    loss: Loss = "hold"
     loss_after: float = 0.1
     body: Body = field(default_factory=Body)
     sensors: Sensors = field(default_factory=Sensors)
@@ -120,7 +121,8 @@ class StandIn:
         self.motors, self._battery = Motors(), Battery()
         self.remote = Remote()
         self.accepted, self.refused = 0, Counter[str]()
-        self._strict, self.loss, self._loss_after = settings.strict, settings.loss, settings.loss_after
+        self._strict, self._loss_after = settings.strict, settings.loss_after
+        self.loss: Loss = settings.loss
         self._push, self._push_until = np.zeros(3), 0.0
 
         start = _start(settings.start)
@@ -166,10 +168,6 @@ class StandIn:
             self._physics()
         self.motors.warm(PERIOD)
         self._battery.draw(self.motors.torque, self._data.qvel[6:], PERIOD)
-        if not np.isfinite(self._data.qpos).all():
-            raise RuntimeError(
-                f"the simulated robot diverged at {self.time:.3f} s: are the last command's gains too high?"
-            )
         return self.states.send([encode_state(self._measure())])
 
     def truth(self) -> Truth:
@@ -230,6 +228,10 @@ class StandIn:
         data.qfrc_applied[6:] = self.motors.drive(self._active(), self._encoders.angle(q), dq)
         data.xfrc_applied[1, :3] = self._push if self.time < self._push_until else 0.0
         mujoco.mj_step(self._model, data)
+        if not np.isfinite(data.qpos).all():
+            raise RuntimeError(
+                f"the simulated robot diverged at {self.time:.3f} s: are the last command's gains too high?"
+            )
 
     def _measure(self) -> RobotState:
         data = self._data
