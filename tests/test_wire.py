@@ -121,7 +121,7 @@ TK_BYTE, TK_UINT8 = 2, 13  # kinds of XTypes; Cyclone DDS 0.10 dies of the secon
 
 
 @pytest.mark.parametrize("message", [LowCmd_, LowState_, Request_, Response_], ids=lambda it: it.__name__)
-def test_octets_are_announced_as_bytes(message: type) -> None:
+def test_octets_are_announced_as_bytes(message: Any) -> None:
     announced = str(message.__idl__.get_type_mapping())
     assert f"TypeIdentifier[Union]({TK_BYTE}, None)" in announced
     assert f"TypeIdentifier[Union]({TK_UINT8}, None)" not in announced
