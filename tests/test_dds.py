@@ -25,7 +25,7 @@ from deploy.motion_switcher import MotionSwitcher, MotionSwitcherError, MotionSw
 from tests import wire
 
 PEERS = Path(__file__).parent / "dds_peers.py"
-DOMAIN = 20 + os.getpid() % 200  # test runs side by side do not hear each other
+DOMAIN = 20 + os.getpid() % 100  # test runs side by side do not hear each other
 OTHER = 2 + os.getpid() % 18
 
 sdk = pytest.mark.skipif(
@@ -101,6 +101,12 @@ def test_a_reader_keeps_what_it_has_not_taken() -> None:
     time.sleep(0.1)
     assert [decode_state(frame).tick for frame in reader.take()] == list(range(12, 20))
     assert reader.take() == []
+
+
+def test_half_a_frame_is_not_sent() -> None:
+    writer = Link(DOMAIN).publisher("rt/lowcmd", LowCmd_)
+    with pytest.raises(LinkError, match="cannot send 406 octets on rt/lowcmd"):
+        writer.write(encode_command(wire.command())[:406])
 
 
 def test_wrong_links() -> None:

@@ -26,7 +26,7 @@ from hmc.sim.mujoco import MujocoSim
 from tools.robot.body import EXACT, Body, build
 from tools.robot.motors import LIMP, Motors, damp, hold, limit, servo
 from tools.robot.sensors import CLEAN, Battery, Feet, Imu, Sensors, roll_pitch_yaw
-from tools.robot.standin import DAMPING, LYING, PERIOD, Settings, StandIn, kind
+from tools.robot.standin import DAMPING, LYING, PERIOD, Settings, StandIn, ideal
 
 HOME = go2.HOME.numpy().astype(np.float64)
 STAND = encode_command(hold(HOME, 60.0, 5.0))
@@ -42,7 +42,7 @@ def last(robot: StandIn, frames: list[bytes], steps: int = 1) -> RobotState:
 
 def ready(settings: Settings | None = None) -> StandIn:
     """A released robot that stands."""
-    robot = StandIn(settings or kind())
+    robot = StandIn(settings or ideal())
     robot.release(True)
     return robot
 
@@ -178,7 +178,7 @@ def test_bodies_differ_within_bounds() -> None:
 
 def test_joint_zeros_reach_the_servo() -> None:
     """Told to go where its encoders read HOME, the robot goes elsewhere by their zeros."""
-    robot = ready(replace(kind(), body=replace(EXACT, zero=math.radians(2.0))))
+    robot = ready(replace(ideal(), body=replace(EXACT, zero=math.radians(2.0))))
     state = last(robot, [STAND], 300)
     off = state.q - robot.truth().qpos[7:]
     assert 0.01 < np.abs(off).max() <= math.radians(2.0)
@@ -208,7 +208,7 @@ def test_divergence_is_an_error() -> None:
 
 
 def test_commands_wait_for_release() -> None:
-    robot = StandIn(kind())
+    robot = StandIn(ideal())
     limp = encode_command(LIMP)
     last(robot, [limp], 200)
     assert robot.refused == {"not released": 200}
@@ -244,14 +244,14 @@ def test_broken_commands_are_refused(reason: str) -> None:
 
 
 def test_lenient_robot_takes_commands_without_header() -> None:
-    robot = ready(replace(kind(), strict=False))
+    robot = ready(replace(ideal(), strict=False))
     robot.step([BROKEN["head"], BROKEN["level flag"], BROKEN["checksum"]])
     assert (robot.refused, robot.accepted) == ({"checksum": 1}, 2)
 
 
 @pytest.mark.parametrize("loss", ["hold", "damp", "limp"])
 def test_commands_stop(loss: str) -> None:
-    robot = ready(replace(kind(), loss=loss, loss_after=0.1))
+    robot = ready(replace(ideal(), loss=loss, loss_after=0.1))
     last(robot, [STAND], 400)
     before = robot.truth()
     last(robot, [], 49)
@@ -268,7 +268,7 @@ def test_commands_stop(loss: str) -> None:
 
 
 def test_foot_stand_is_held_until_the_first_command() -> None:
-    robot = StandIn(kind(start="footstand"))
+    robot = StandIn(ideal(start="footstand"))
     start = robot.truth().qpos
     state = last(robot, [], 300)
     assert robot.truth().qpos == pytest.approx(start, abs=0.02)
@@ -278,7 +278,7 @@ def test_foot_stand_is_held_until_the_first_command() -> None:
 
 
 def test_lying_robot_lies() -> None:
-    robot = StandIn(kind(start="lying"))
+    robot = StandIn(ideal(start="lying"))
     last(robot, [], 250)
     truth = robot.truth()
     assert truth.qpos[2] < 0.12
@@ -334,7 +334,7 @@ def test_slow_imu_repeats_itself() -> None:
 
 
 def test_encoders_count() -> None:
-    robot = ready(replace(kind(), sensors=replace(CLEAN, encoder=0.01)))
+    robot = ready(replace(ideal(), sensors=replace(CLEAN, encoder=0.01)))
     state = last(robot, [STAND], 10)
     assert state.q == pytest.approx(np.round(state.q / 0.01) * 0.01, abs=1e-6)
     assert np.abs(state.q - robot.truth().qpos[7:]).max() <= 0.005 + 1e-6

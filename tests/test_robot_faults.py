@@ -15,7 +15,7 @@ from deploy.remote import Button
 from tests import wire
 from tools.robot.faults import Faults, Way
 from tools.robot.orders import Desk, obey
-from tools.robot.standin import StandIn, kind
+from tools.robot.standin import StandIn, ideal
 
 COUNT = 2000
 
@@ -98,7 +98,7 @@ def test_probabilities(value: float) -> None:
 
 
 def test_orders() -> None:
-    robot = StandIn(kind())
+    robot = StandIn(ideal())
     obey(robot, '{"states": {"drop": 0.25}, "commands": {"late": 0.5, "stall": 0.02}, "loss": "damp"}')
     assert robot.states.faults == Faults(drop=0.25)
     assert robot.commands.faults == Faults(late=0.5, stall=0.02)
@@ -116,7 +116,7 @@ def test_orders() -> None:
 
 
 def test_push_order() -> None:
-    robot = StandIn(kind())
+    robot = StandIn(ideal())
     obey(robot, '{"push": [0, 80, 0, 0.05]}')
     for _ in range(25):
         robot.step([])
@@ -139,11 +139,11 @@ def test_push_order() -> None:
 )
 def test_wrong_orders(order: str, told: str) -> None:
     with pytest.raises(ValueError, match=told):
-        obey(StandIn(kind()), order)
+        obey(StandIn(ideal()), order)
 
 
 def test_desk_answers() -> None:
-    robot, desk = StandIn(kind()), Desk(0)
+    robot, desk = StandIn(ideal()), Desk(0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(2)
         client.connect(("127.0.0.1", desk.port))

@@ -109,11 +109,11 @@ def echo(domain: int) -> None:
     from deploy.codec import decode_command, decode_state, encode_state
     from deploy.dds import Link
     from deploy.messages import LowCmd_, LowState_
-    from tools.robot.standin import StandIn, kind
+    from tools.robot.standin import StandIn, ideal
 
     link = Link(domain)
     commands, states = link.subscriber("rt/lowcmd", LowCmd_), link.publisher("rt/lowstate", LowState_)
-    state = decode_state(StandIn(kind()).step([])[0])
+    state = decode_state(StandIn(ideal()).step([])[0])
     while True:
         for frame in commands.take(1.0):
             motors = decode_command(frame).motors

@@ -75,7 +75,7 @@ class Settings:
     commands: Faults = field(default_factory=Faults)
 
 
-def kind(seed: int = 0, start: Start = "standing") -> Settings:
+def ideal(seed: int = 0, start: Start = "standing") -> Settings:
     """A robot without any unkindness: the planner's body, exact sensors, no delay."""
     return Settings(seed=seed, start=start, command_delay=0.0, body=EXACT, sensors=CLEAN)
 
