@@ -8,8 +8,6 @@ import socket
 import numpy as np
 import pytest
 
-pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
-
 from deploy.codec import COMMAND_SIZE, decode_command, decode_state, encode_command, encode_state
 from deploy.remote import Button
 from tests import wire
@@ -92,9 +90,6 @@ def test_nan_comes_under_a_good_checksum(frame: bytes) -> None:
 def test_probabilities(value: float) -> None:
     with pytest.raises(ValueError, match=f"drop of frames must be 0 to 1, got {value}"):
         Faults(drop=value)
-
-
-# ---------------------------------------------------------------------------------- orders
 
 
 def test_orders() -> None:

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
-
 from deploy.codec import encode_command
 from hmc.go2 import model as go2
 from hmc.go2.policy import Policy

@@ -52,8 +52,8 @@ class Settings:
             place until the first command.
         strict: refuse commands without the header and level flag that the robot's own firmware wants;
             some programs do not send them.
-        state_delay: from the measurement until a state frame leaves [s].
-        command_delay: from the arrival of a command until it acts [s].
+        state_delay: from the measurement until a state frame leaves [s]; whole PERIODs.
+        command_delay: from the arrival of a command until it acts [s]; whole PERIODs.
         loss: what the motors do when commands stop: hold the last one, damp, or go limp.
         loss_after: so long after the last command [s].
         body: how it differs from the planner's model.
@@ -128,7 +128,7 @@ class StandIn:
         start = _start(settings.start)
         self._data.qpos[:] = start
         self._own = damp(DAMPING) if settings.start == "lying" else hold(start[7:], 60.0, 5.0)
-        self._command, self._heard = self._own, math.inf
+        self._command, self._heard = self._own, math.inf  # time of the last command: none to lose yet
         self.released = settings.start == "footstand"
         self._model.eq_data[0, :10] = [0, 0, 0, *start[:7]]  # grip at the base's origin, in this pose
         self._data.eq_active[0] = self.released
