@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from deploy.codec import (
-    encode_command,
-    seal,
-)
+from deploy.codec import decode_state, encode_command, seal
 from hmc.go2 import model as go2
 from hmc.sim.mujoco import MujocoSim
 from tests.robots import HOME, STAND, last, ready
 from tools.robot.body import EXACT, Body, build
 from tools.robot.motors import LIMP, damp, hold
+from tools.robot.sensors import CLEAN
 from tools.robot.standin import DAMPING, LYING, PERIOD, Settings, StandIn, ideal
 
 
@@ -158,6 +156,26 @@ def test_commands_stop(loss: str) -> None:
         assert (np.abs(truth.torque).max() == 0) == (loss == "limp")
     last(robot, [STAND], 200)
     assert robot.truth().qpos[2] == pytest.approx(before.qpos[2], abs=0.01)  # and it gets up again
+
+
+def test_delays() -> None:
+    """States leave 6 ms late with the tick of their measurement; commands act 4 ms late."""
+    robot = ready(replace(ideal(), state_delay=0.006, command_delay=0.004))
+    sent, accepted = [], []
+    for _ in range(6):
+        sent.append([decode_state(frame).tick for frame in robot.step([STAND])])
+        accepted.append(robot.accepted)
+    assert sent == [[], [], [], [2], [4], [6]]
+    assert accepted == [0, 0, 1, 2, 3, 4]
+
+
+def test_sensors_do_not_change_the_body() -> None:
+    """Each part draws from a stream of its own, so that one can be switched off alone."""
+    noisy, clean = ready(Settings(seed=2)), ready(Settings(seed=2, sensors=CLEAN))
+    for robot in (noisy, clean):
+        last(robot, [encode_command(damp(2.0))], 50)
+    assert np.array_equal(noisy._model.body_mass, clean._model.body_mass)
+    assert noisy.truth().qpos == pytest.approx(clean.truth().qpos, abs=1e-3)
 
 
 def test_foot_stand_is_held_until_the_first_command() -> None:
