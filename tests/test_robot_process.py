@@ -20,7 +20,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
 
 from deploy.codec import RobotState, decode_state, encode_command
-from deploy.dds import Link, Subscriber
+from deploy.dds import Link, LinkError, Subscriber
 from deploy.messages import LowCmd_, LowState_, WirelessController_
 from deploy.motion_switcher import MotionSwitcher
 from deploy.remote import Button, unpack
@@ -28,7 +28,7 @@ from hmc.go2 import model as go2
 from tools.go2_robot import main
 from tools.robot.motors import hold
 from tools.robot.orders import obey
-from tools.robot.process import Args
+from tools.robot.process import Args, run
 from tools.robot.standin import Settings, StandIn
 
 ROOT = Path(__file__).parent.parent
@@ -48,7 +48,7 @@ def robot(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
             assert port, line
             yield process, int(port[1])
         finally:
-            process.kill()
+            process.terminate()
 
 
 def order(port: int, what: dict[str, object]) -> dict[str, object]:
@@ -79,6 +79,10 @@ def test_a_controller_meets_it(tmp_path: Path) -> None:
         assert states.take(10), "no state"
         switcher = MotionSwitcher(link, timeout=10)
         assert switcher.active() == "mcf"
+        with pytest.raises(LinkError, match=f"robot in domain {DOMAIN} on lo already: .*{process.pid}"):
+            run(Args(domain=DOMAIN), stopped=lambda: True, say=print)
+
+        states.take()
         heard = hear(states, 0.5)
         ticks = np.array([state.tick for state in heard])
         assert (np.diff(ticks) == 2).all()  # none lost, in order

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.dds import LOOPBACK, SIMULATION_DOMAIN, Link
+from deploy.dds import LOOPBACK, SIMULATION_DOMAIN, Link, LinkError
 from deploy.messages import LowCmd_, LowState_, WirelessController_
 from deploy.motion_switcher import MotionSwitcherService
 from tools.robot.orders import Desk, obey
 from tools.robot.standin import PERIOD, Settings, StandIn, Truth
 
 CONTROLLER = "mcf"  # what the motion switcher calls the robot's own controller
+COMPANY = 0.3  # s that other robots get to be found
 LATEST = 0.05  # s behind the clock, at most; then the robot loses time instead of hurrying after it
 
 
@@ -75,11 +76,16 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
         args: what robot, where.
         stopped: asked at every step.
         say: told when the robot is ready, and in the end how it kept time.
+
+    Raises:
+        LinkError: the network interface cannot be used, or a robot is there already.
+        ValueError: an order is none.
     """
+    link = Link(args.domain, args.interface)
     robot = StandIn(args.robot)
     for order in args.order:
         obey(robot, order)
-    link = Link(args.domain, args.interface)
+    _refuse_company(link, args)
     commands, states = link.subscriber("rt/lowcmd", LowCmd_), link.publisher("rt/lowstate", LowState_)
     remote = link.publisher("rt/wirelesscontroller", WirelessController_)
     switcher = MotionSwitcherService(link, "" if robot.released else CONTROLLER)
@@ -109,6 +115,16 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
     desk.close()
     log.write()
     say(f"ended after {robot.time:.3f} s; {clock.report()}; refused commands: {dict(robot.refused)}")
+
+
+def _refuse_company(link: Link, args: Args) -> None:
+    """A controller must not hear two robots, least of all a real one and this."""
+    time.sleep(COMPANY)
+    if others := link.rivals("rt/lowstate"):
+        raise LinkError(
+            f"there is a robot in domain {args.domain} on {args.interface} already: {', '.join(others)}. "
+            "End it (one that was killed counts for 3 s more), or take another --domain."
+        )
 
 
 def _pressed(robot: StandIn) -> WirelessController_:
