@@ -13,6 +13,7 @@ from tools.benchmarks.engine import Engine
 from tools.benchmarks.figures import Common, Figures
 from tools.benchmarks.planner import Planner
 from tools.benchmarks.train import Train
+from tools.benchmarks.wire import Wire
 from tools.random_policy import write_random_policy
 
 SMALL = {
@@ -41,11 +42,17 @@ SMALL = {
         Planner(threads=1, horizon=6, cartpole_horizon=10, samples=16, ticks=1, repeats=1),
         {"us_per_candidate", "cartpole_exact_ms", "cartpole_converged_ms"},
     ),
+    "wire": (
+        Wire(threads=1, repeats=20, messages=20),
+        {"crc_us", "state_decode_us", "robot_share", "round_trip_ms_p50", "answered"},
+    ),
 }
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if name == "wire":
+        pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
     args, expected = SMALL[name]
     out = tmp_path / "new" / "figures.json"
     if name == "planner":  # with policies that have learned nothing, so that the Go2's part runs everywhere

@@ -10,7 +10,8 @@ import torch
 
 from hmc.go2 import model as go2
 from hmc.go2.conditions import NoiseCfg
-from hmc.go2.observe import OBS_SIZE, observe, pitch
+from hmc.go2.facts import OBS_SIZE
+from hmc.go2.observe import observe, pitch
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STANCES
 from tests.tiny import CFG, make_env
 from tools.random_policy import write_random_policy

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from hmc.go2 import model as go2
-from hmc.go2.observe import OBS_SIZE, anchor_of, observe, pitch
+from hmc.go2.facts import OBS_SIZE
+from hmc.go2.observe import anchor_of, observe, pitch
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STANCES
 
 

@@ -13,8 +13,9 @@ import torch
 from tensordict import TensorDict
 
 from hmc.go2 import model as go2
-from hmc.go2.observe import OBS_SIZE, anchor_of, observe
-from hmc.go2.policy import Policy, contract
+from hmc.go2.facts import OBS_SIZE, contract
+from hmc.go2.observe import anchor_of, observe
+from hmc.go2.policy import Policy
 from hmc.go2.stances import HANDSTAND, STANCES
 from tests.tiny import CFG, make_runner
 from train.config import ROOT, config_hash, portable

@@ -1,4 +1,4 @@
-"""How fast it is, relative to the bare engine: `python tools/bench.py engine|train|planner [--json FILE]`.
+"""How fast it is: `python tools/bench.py engine|train|planner|wire [--json FILE]`.
 
 Ratios are taken between two ways of doing the same work that take turns within one run, so that they mean
 something on a busy machine too; rates a second do only on an idle one. What is compared is checked to have
@@ -21,10 +21,11 @@ from tools.benchmarks.engine import Engine, engine
 from tools.benchmarks.figures import cores, machine
 from tools.benchmarks.planner import Planner, planner
 from tools.benchmarks.train import Train, train
+from tools.benchmarks.wire import Wire, wire
 from tools.study import write_json
 
 
-def main(args: Engine | Train | Planner) -> int:
+def main(args: Engine | Train | Planner | Wire) -> int:
     """Measure, print, write."""
     threads = args.threads or cores()
     args = replace(args, threads=threads)
@@ -32,10 +33,15 @@ def main(args: Engine | Train | Planner) -> int:
     torch.manual_seed(0)
     name = type(args).__name__.lower()
     host = machine(threads)
-    if isinstance(args, Engine):
-        figures = engine(args)
-    else:
-        figures = train(args) if isinstance(args, Train) else planner(args)
+    match args:
+        case Engine():
+            figures = engine(args)
+        case Train():
+            figures = train(args)
+        case Planner():
+            figures = planner(args)
+        case Wire():
+            figures = wire(args)
     console = Console()
     console.print(figures.table(f"bench {name}"))
     for key, note in figures.notes.items():
@@ -49,4 +55,4 @@ def main(args: Engine | Train | Planner) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Engine | Train | Planner)))
+    sys.exit(main(tyro.cli(Engine | Train | Planner | Wire)))

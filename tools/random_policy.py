@@ -10,8 +10,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from hmc.go2.observe import OBS_SIZE
-from hmc.go2.policy import contract
+from hmc.go2.facts import OBS_SIZE, contract
 from hmc.go2.stances import HANDSTAND
 
 HIDDEN = (256, 128, 64)

@@ -29,7 +29,7 @@ from hmc.go2.task import flip_task  # noqa: E402
 from tools import figures, study  # noqa: E402
 from tools.closed_loop import study_cfg  # noqa: E402
 from tools.robustness_study import PLANNERS, RobustnessCfg, Row, jobs, work  # noqa: E402
-from tools.wilson import Score  # noqa: E402
+from train.score import Score  # noqa: E402
 
 
 def score(rows: list[Row]) -> Score:

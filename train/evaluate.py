@@ -21,7 +21,7 @@ from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.conditions import Conditions, NoiseCfg, Robots  # noqa: E402
 from hmc.go2.policy import Policy  # noqa: E402
 from hmc.go2.stances import STANCES, Stance  # noqa: E402
-from tools.wilson import Score  # noqa: E402
+from train.score import Score  # noqa: E402
 from train.starts import Starts, StartsCfg  # noqa: E402
 
 # name -> (time to reach the stance, time to hold it from then on) [s]

@@ -24,8 +24,8 @@ from tensordict import TensorDict  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
 from hmc.cli import one_line_errors  # noqa: E402
-from hmc.go2.observe import OBS_SIZE  # noqa: E402
-from hmc.go2.policy import Policy, contract  # noqa: E402
+from hmc.go2.facts import OBS_SIZE, contract  # noqa: E402
+from hmc.go2.policy import Policy  # noqa: E402
 from hmc.go2.stances import STANCES  # noqa: E402
 from train.config import config_hash, portable  # noqa: E402
 from train.runner import read_checkpoint  # noqa: E402

@@ -1,12 +1,6 @@
-"""The Unitree Go2: joint order, poses, limits, motor law and forward kinematics, with their sources.
+"""The Unitree Go2 for simulators and networks: compiled model, motor law and forward kinematics.
 
-Frames: the base frame has x forward, y left, z up, its origin at the trunk's centre. Joint order is
-(FL, FR, RL, RR) x (hip, thigh, calf) everywhere. Lengths in m, angles in rad, torques in N m.
-
-Sources: masses, inertias, offsets and joint limits are Unitree's, as published in MuJoCo Menagerie's
-unitree_go2 (BSD-3-Clause); the motor's torque-speed curve is the one Unitree publishes for its Go2
-actuators in unitree_rl_lab: 20.2 N m up to 13.5 rad/s, then linearly down to zero at 30 rad/s, on the
-hip and the thigh; the calf is geared by a further 1.917.
+Its figures, with their sources, are in `hmc.go2.facts`; frames and units as there.
 """
 
 from __future__ import annotations
@@ -18,34 +12,33 @@ import mujoco
 import torch
 from torch import Tensor
 
-LEGS = ("FL", "FR", "RL", "RR")
-JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "calf"))
-FRONT, REAR = (0, 1), (2, 3)
+from hmc.go2 import facts
+from hmc.go2.facts import CALF_END as CALF_END
+from hmc.go2.facts import DT as DT
+from hmc.go2.facts import FOOT_BACK as FOOT_BACK
+from hmc.go2.facts import FOOT_RADIUS as FOOT_RADIUS
+from hmc.go2.facts import FRONT as FRONT
+from hmc.go2.facts import HIP_CENTRE as HIP_CENTRE
+from hmc.go2.facts import HIP_LENGTH as HIP_LENGTH
+from hmc.go2.facts import HIP_X as HIP_X
+from hmc.go2.facts import HIP_Y as HIP_Y
+from hmc.go2.facts import HOME_HEIGHT as HOME_HEIGHT
+from hmc.go2.facts import JOINTS as JOINTS
+from hmc.go2.facts import KD as KD
+from hmc.go2.facts import KP as KP
+from hmc.go2.facts import LEGS as LEGS
+from hmc.go2.facts import LINK as LINK
+from hmc.go2.facts import NO_LOAD as NO_LOAD
+from hmc.go2.facts import PEAK as PEAK
+from hmc.go2.facts import REAR as REAR
+from hmc.go2.facts import STALL as STALL
+from hmc.go2.facts import STANCE_HEIGHT as STANCE_HEIGHT
+from hmc.go2.facts import SUBSTEPS as SUBSTEPS
 
-Q_LOWER = torch.tensor([-1.0472, -1.5708, -2.7227] * 2 + [-1.0472, -0.5236, -2.7227] * 2)
-Q_UPPER = torch.tensor([1.0472, 3.4907, -0.83776] * 2 + [1.0472, 4.5379, -0.83776] * 2)
-
-KP, KD = 35.0, 0.5  # N m/rad, N m s/rad
-GEAR = torch.tensor([1.0, 1.0, 1.917] * 4)  # calf linkage relative to the hip and thigh motors
-STALL = 20.2 * 30.0 / (30.0 - 13.5)  # the driving line extended to zero speed [N m]
-NO_LOAD = 30.0  # rad/s, before GEAR
-PEAK = 20.2  # N m, before GEAR
-
-# Balanced poses: the centre of mass is within 1 mm of the middle of the supporting feet.
-HOME = torch.tensor([0.0, 0.9, -1.8] * 4)
-HANDSTAND = torch.tensor([0.0, -0.966, -1.16] * 2 + [0.0, 1.7, -1.853] * 2)
-FOOTSTAND = torch.tensor([0.0, 0.82, -1.6] * 2 + [0.0, 2.12, -1.16] * 2)
-HOME_HEIGHT = 0.29
-STANCE_HEIGHT = 0.573
-
-HIP_X, HIP_Y, HIP_LENGTH, LINK = 0.1934, 0.0465, 0.0955, 0.213
-FOOT_RADIUS = 0.022
-HIP_CENTRE = 0.08  # of the hip's sphere, sideways from its joint
-CALF_END = (0.01, 0.17)  # where the shin's capsule ends: forward and down from the knee
-
-
-DT = 0.02  # s, the control step that policies are trained at
-SUBSTEPS = 4  # physics steps a control step
+Q_LOWER, Q_UPPER = torch.tensor(facts.Q_LOWER), torch.tensor(facts.Q_UPPER)
+GEAR = torch.tensor(facts.GEAR)
+HOME = torch.tensor(facts.HOME)
+HANDSTAND, FOOTSTAND = torch.tensor(facts.HANDSTAND), torch.tensor(facts.FOOTSTAND)
 
 
 def load_model(substeps: int = SUBSTEPS, iterations: int | None = None) -> mujoco.MjModel:
@@ -168,8 +161,8 @@ def leg_points(q: Tensor) -> Tensor:
     zero = torch.zeros_like(hip)
     knee_x, knee_z = -LINK * thigh.sin(), LINK * thigh.cos()
     shank = thigh + knee
-    foot_x = knee_x - LINK * shank.sin() - 0.002 * shank.cos()
-    foot_z = knee_z + LINK * shank.cos() - 0.002 * shank.sin()
+    foot_x = knee_x - LINK * shank.sin() - FOOT_BACK * shank.cos()
+    foot_z = knee_z + LINK * shank.cos() - FOOT_BACK * shank.sin()
     return torch.stack([place(zero, zero), place(knee_x, knee_z), place(foot_x, foot_z)], 2)
 
 
@@ -205,7 +198,7 @@ def clearances(x: Tensor) -> dict[str, Tensor]:
     drop = LINK * (down[..., None] * cos[..., 1:] - tx[..., None] * sin[..., 1:])
     knee = hip + drop[..., 0]
     ahead = tx * cos[..., 2] + down * sin[..., 2]
-    foot = knee + drop[..., 1] - 0.002 * ahead
+    foot = knee + drop[..., 1] - FOOT_BACK * ahead
     calf_end = knee + CALF_END[1] / LINK * drop[..., 1] + CALF_END[0] * ahead
     px, py, pz, radius = TRUNK_POINTS.to(x).unbind(1)
     return {

@@ -7,9 +7,6 @@ from torch import Tensor
 
 from hmc.go2.model import rotation, vertical
 
-OBS_SIZE = 48
-OBS_VERSION = 1
-
 
 def observe(x: Tensor, u: Tensor, anchor: Tensor) -> Tensor:
     """Observation of DESIGN's 48 numbers, (n, 48).

@@ -12,20 +12,9 @@ import torch
 from torch import Tensor
 
 from hmc.go2 import model as go2
-from hmc.go2.observe import OBS_SIZE, OBS_VERSION, anchor_of, observe
+from hmc.go2.facts import disagreement
+from hmc.go2.observe import anchor_of, observe
 from hmc.modes import Mode
-
-
-def contract() -> dict[str, Any]:
-    """What a policy file must agree with, field by field."""
-    return {
-        "observation_version": OBS_VERSION,
-        "observation_size": OBS_SIZE,
-        "joint_order": list(go2.JOINTS),
-        "kp": go2.KP,
-        "kd": go2.KD,
-        "control_dt": go2.DT,
-    }
 
 
 class Policy(Mode):
@@ -79,23 +68,8 @@ class Policy(Mode):
         return (pose + self._scale * action).clamp(lower, upper), memory
 
     def _check(self) -> None:
-        for field, expected in contract().items():
-            if field not in self.metadata:
-                raise ValueError(
-                    f"policy {self.path}: its metadata lacks {field!r}, expected {expected!r}: "
-                    "export it with train/export.py"
-                )
-            came = self.metadata[field]
-            if came != expected:
-                raise ValueError(
-                    f"policy {self.path}: {field} is {came!r}, expected {expected!r}: it was trained for "
-                    "another version of this robot's interface; train and export it again"
-                )
-        for field in ("mode", "default_pose", "action_scale"):
-            if field not in self.metadata:
-                raise ValueError(
-                    f"policy {self.path}: its metadata lacks {field!r}: export it with train/export.py"
-                )
+        if wrong := disagreement(self.metadata):
+            raise ValueError(f"policy {self.path}: {wrong}")
 
 
 def _decoded(text: str) -> Any:

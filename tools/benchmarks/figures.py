@@ -23,6 +23,7 @@ AT_MOST = {
     "shared_fraction": 0.30,
     "pruned_fraction": 0.10,
     "mppi_overhead": 1.10,
+    "crc_us": 5.0,
 }
 
 

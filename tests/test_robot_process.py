@@ -1,0 +1,162 @@
+"""The stand-in as a process of its own, met as a controller meets the robot."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
+
+from deploy.codec import RobotState, decode_state, encode_command
+from deploy.dds import Link, LinkError, Subscriber
+from deploy.messages import LowCmd_, LowState_, WirelessController_
+from deploy.motion_switcher import MotionSwitcher
+from deploy.remote import Button, unpack
+from hmc.go2 import model as go2
+from tools.go2_robot import main
+from tools.robot.motors import hold
+from tools.robot.orders import obey
+from tools.robot.process import Args, run
+from tools.robot.standin import Settings, StandIn
+
+ROOT = Path(__file__).parent.parent
+DOMAIN = 120 + os.getpid() % 100  # not that of test_dds.py: a killed robot lingers
+STAND = encode_command(hold(go2.HOME.numpy().astype(np.float64), 60.0, 5.0))
+
+
+@contextmanager
+def robot(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """The process once it is ready, and its port for orders."""
+    command = [sys.executable, "tools/go2_robot.py", "--domain", str(DOMAIN), *arguments]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            port = re.search(r"ready: domain \d+ on lo, orders at UDP port (\d+)", line)
+            assert port, line
+            yield process, int(port[1])
+        finally:
+            process.terminate()
+
+
+def order(port: int, what: dict[str, object]) -> dict[str, object]:
+    """Send an order; the answer."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.settimeout(5)
+        client.sendto(json.dumps(what).encode(), ("127.0.0.1", port))
+        answer = json.loads(client.recv(65536))
+    assert "error" not in answer
+    return answer
+
+
+def hear(states: Subscriber, seconds: float) -> list[RobotState]:
+    """States that come in this time."""
+    until, heard = time.monotonic() + seconds, []
+    while (left := until - time.monotonic()) > 0:
+        heard += [decode_state(frame) for frame in states.take(left)]
+    return heard
+
+
+def test_a_controller_meets_it(tmp_path: Path) -> None:
+    link = Link(DOMAIN)
+    states = link.subscriber("rt/lowstate", LowState_, depth=1000)
+    commands = link.publisher("rt/lowcmd", LowCmd_)
+    sticks = link.subscriber("rt/wirelesscontroller", WirelessController_)
+    log = tmp_path / "new" / "truth.npz"
+    with robot("--log", str(log), "--robot.seed", "5") as (process, port):
+        assert states.take(10), "no state"
+        switcher = MotionSwitcher(link, timeout=10)
+        assert switcher.active() == "mcf"
+        with pytest.raises(LinkError, match=f"robot in domain {DOMAIN} on lo already: .*{process.pid}"):
+            run(Args(domain=DOMAIN), stopped=lambda: True, say=print)
+
+        states.take()
+        heard = hear(states, 0.5)
+        ticks = np.array([state.tick for state in heard])
+        assert (np.diff(ticks) == 2).all()  # none lost, in order
+        assert all(state.crc_ok for state in heard)
+        assert 50 < len(heard) < 300  # 500 Hz, on a busy machine too
+
+        commands.write(STAND)
+        time.sleep(0.1)
+        assert order(port, {})["refused"] == {"not released": 1}
+        switcher.release()
+        for _ in range(100):
+            commands.write(STAND)
+            time.sleep(0.002)
+        answer = order(port, {"stuck": {"FR": 77}, "remote": {"buttons": ["B"]}, "states": {"corrupt": 0.5}})
+        assert answer["released"]
+        assert int(str(answer["accepted"])) > 50
+
+        states.take()
+        time.sleep(0.1)
+        heard = hear(states, 0.4)
+        good = [state for state in heard if state.crc_ok]
+        assert 0.3 < len(good) / len(heard) < 0.7
+        assert all(state.foot_force[1] == 77 for state in good[5:])
+        assert unpack(good[-1].remote).buttons == Button.B
+        assert WirelessController_.deserialize(sticks.take()[-1]).keys == Button.B
+
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout is not None
+        assert "ended after" in process.stdout.read()
+        assert process.wait(10) == 0
+    with np.load(log) as truth:
+        assert truth["qpos"].shape == (len(truth["tick"]), 19)
+        assert (np.diff(truth["tick"].astype(int)) == 2).all()
+        assert truth["qpos"][-1, 2] > 0.2
+
+
+def test_lockstep_is_the_class_to_the_byte() -> None:
+    """The process adds nothing of its own to what `StandIn` does with the same frames."""
+    upset = {"push": [30, 0, 0, 0.05], "states": {"nan": 0.1}}
+    link = Link(DOMAIN)
+    states, commands = link.subscriber("rt/lowstate", LowState_), link.publisher("rt/lowcmd", LowCmd_)
+    heard: dict[int, bytes] = {}
+    with robot("--lockstep", "--robot.start", "footstand", "--robot.seed", "9") as (_, port):
+        while not commands.peers:
+            time.sleep(0.01)
+        order(port, upset)
+        while len(heard) < 60:
+            for frame in states.take(5):
+                tick = decode_state(frame).tick
+                if tick not in heard:  # it repeats itself until it is answered
+                    heard[tick] = frame
+                    commands.write(STAND)
+
+    here = StandIn(Settings(seed=9, start="footstand"))
+    expected = here.step([])
+    obey(here, json.dumps(upset))
+    for _ in range(59):
+        expected += here.step([STAND])
+    assert list(heard.values()) == expected
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        (Args(interface="eth77"), "no network interface 'eth77'"),
+        (Args(order=('{"jump": 1}',)), "no order 'jump'"),
+    ],
+)
+def test_errors_are_one_line(
+    args: Args, told: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the test run keeps its own handlers
+    assert main(args) == 1
+    _, err = capsys.readouterr()
+    assert err.startswith("go2_robot: ")
+    assert told in err
+    assert err.count("\n") == 1

@@ -1,0 +1,31 @@
+"""A stand-in for the robot on the robot's own topics: `python tools/go2_robot.py --robot.start lying`."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import tyro
+
+from deploy.dds import LinkError
+from tools.robot.process import Args, run
+
+
+def main(args: Args) -> int:
+    """Be the robot until its time is over, or SIGINT or SIGTERM."""
+    told: list[int] = []
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, lambda number, _: told.append(number))
+    try:
+        run(args, stopped=lambda: bool(told), say=lambda text: print(text, flush=True))
+    except (LinkError, ValueError, RuntimeError) as error:
+        print(f"go2_robot: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Args)))

@@ -1,0 +1,170 @@
+"""The stand-in as a process: DDS, the motion switcher, orders, a clock and a log around `StandIn`."""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from deploy.dds import LOOPBACK, SIMULATION_DOMAIN, Link, LinkError
+from deploy.messages import LowCmd_, LowState_, WirelessController_
+from deploy.motion_switcher import MotionSwitcherService
+from tools.robot.orders import Desk, obey
+from tools.robot.standin import PERIOD, Settings, StandIn, Truth
+
+CONTROLLER = "mcf"  # what the motion switcher calls the robot's own controller
+COMPANY = 0.3  # s that other robots get to be found
+LATEST = 0.05  # s behind the clock, at most; then the robot loses time instead of hurrying after it
+
+
+@dataclass(frozen=True)
+class Args:
+    """A Go2 that is not there, on the robot's own topics.
+
+    Attributes:
+        robot: the robot.
+        domain: of DDS.
+        interface: network interface.
+        port: UDP port of this machine for orders, see `tools.robot.orders`; 0 for any free one.
+        order: orders at the start, JSON objects.
+        log: file for the truth, .npz; none is written without.
+        seconds: of simulated time, then it ends.
+        lockstep: wait for a command after every state instead of keeping time: for tests that repeat.
+    """
+
+    robot: Settings = field(default_factory=Settings)
+    domain: int = SIMULATION_DOMAIN
+    interface: str = LOOPBACK
+    port: int = 0
+    order: tuple[str, ...] = ()
+    log: Path | None = None
+    seconds: float = float("inf")
+    lockstep: bool = False
+
+
+class Log:
+    """The truth, step by step, in memory until it is written: 0.2 MB a second."""
+
+    def __init__(self, path: Path | None):
+        self._path = path
+        self._steps: list[Truth] = []
+
+    def add(self, truth: Truth) -> None:
+        """Keep a step."""
+        if self._path is not None:
+            self._steps.append(truth)
+
+    def write(self) -> None:
+        """Write the file: an array (steps, ...) for each field of `Truth`."""
+        if self._path is not None and self._steps:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            columns = zip(*self._steps, strict=True)
+            arrays = {name: np.array(column) for name, column in zip(Truth._fields, columns, strict=True)}
+            np.savez_compressed(self._path, **arrays)  # type: ignore[arg-type]
+
+
+def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
+    """Be the robot until `stopped()` or the time is over.
+
+    Args:
+        args: what robot, where.
+        stopped: asked at every step.
+        say: told when the robot is ready, and in the end how it kept time.
+
+    Raises:
+        LinkError: the network interface cannot be used, or a robot is there already.
+        ValueError: an order is none.
+    """
+    link = Link(args.domain, args.interface)
+    robot = StandIn(args.robot)
+    for order in args.order:
+        obey(robot, order)
+    _refuse_company(link, args)
+    commands, states = link.subscriber("rt/lowcmd", LowCmd_), link.publisher("rt/lowstate", LowState_)
+    remote = link.publisher("rt/wirelesscontroller", WirelessController_)
+    switcher = MotionSwitcherService(link, "" if robot.released else CONTROLLER)
+    desk, log = Desk(args.port), Log(args.log)
+    outgoing = robot.step([])
+    where = f"domain {args.domain} on {args.interface}, orders at UDP port {desk.port}"
+    say(f"ready: {where}, {priority()}")
+    clock = Clock()
+    while robot.time < args.seconds and not stopped():
+        for frame in outgoing:
+            states.write(frame)
+        switcher.serve()
+        robot.release(switcher.name == "")
+        desk.serve(robot)
+        if args.lockstep:
+            frames = commands.take(0.1)
+            if not frames:  # nobody there yet, or a frame was lost: say it again
+                continue
+        else:
+            clock.wait()
+            frames = commands.take()
+        outgoing = robot.step(frames)
+        truth = robot.truth()
+        log.add(truth)
+        if truth.tick % 20 == 0:
+            remote.write(_pressed(robot).serialize(use_version_2=False))
+    desk.close()
+    log.write()
+    say(f"ended after {robot.time:.3f} s; {clock.report()}; refused commands: {dict(robot.refused)}")
+
+
+def _refuse_company(link: Link, args: Args) -> None:
+    """A controller must not hear two robots, least of all a real one and this."""
+    time.sleep(COMPANY)
+    if others := link.rivals("rt/lowstate"):
+        raise LinkError(
+            f"there is a robot in domain {args.domain} on {args.interface} already: {', '.join(others)}. "
+            "End it (one that was killed counts for 3 s more), or take another --domain."
+        )
+
+
+def _pressed(robot: StandIn) -> WirelessController_:
+    lx, ly, rx, ry = robot.remote[1:]
+    return WirelessController_(lx, ly, rx, ry, int(robot.remote.buttons))
+
+
+def priority() -> str:
+    """Ask the kernel for real-time priority, and say what came of it."""
+    gc.collect()
+    gc.freeze()  # what is loaded by now stays: later collections are short
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))
+        return "real-time priority"
+    return "normal priority (real-time needs CAP_SYS_NICE)"
+
+
+class Clock:
+    """Keeps PERIOD, and counts how late it was."""
+
+    def __init__(self) -> None:
+        self._next = time.monotonic()
+        self._late: list[float] = []
+
+    def wait(self) -> None:
+        """Until the next step is due."""
+        self._next += PERIOD
+        now = time.monotonic()
+        if now < self._next:
+            time.sleep(self._next - now)
+            now = time.monotonic()
+        late = now - self._next
+        self._late.append(late)
+        if late > LATEST:
+            self._next = now
+
+    def report(self) -> str:
+        """Lateness of the steps."""
+        if not self._late:
+            return "not timed"
+        p50, p99, worst = 1e3 * np.quantile(self._late, [0.5, 0.99, 1.0])
+        lost = sum(late > LATEST for late in self._late)
+        return f"late by {p50:.2f} / {p99:.2f} / {worst:.2f} ms (half, 99 %, worst), time lost {lost} times"
