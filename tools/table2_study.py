@@ -61,6 +61,8 @@ class Table2Cfg:
     flip: RunCfg = field(default_factory=RunCfg)
 
     def __post_init__(self) -> None:
+        for method in METHODS:
+            replace(self.sampling, method=method)  # what one of them cannot do with shows here
         if set(self.tuning_seeds) & set(range(self.first_seed, self.first_seed + self.trials)):
             raise ValueError(
                 f"tuning_seeds {self.tuning_seeds} must not be among the trials' own, {self.first_seed} to "

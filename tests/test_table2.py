@@ -1,0 +1,129 @@
+"""The comparison of controllers in a tiny setting: rules, tuning, every controller's run, what is written."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from hmc.go2.stances import FOOTSTAND, HANDSTAND
+from hmc.go2.task import flip_task
+from tests.test_flip import SHORT
+from tools import study, table2
+from tools.closed_loop import chosen, run, study_cfg
+from tools.random_policy import write_random_policy
+from tools.table2_study import (
+    CONTROLLERS,
+    FOOT,
+    HAND,
+    JUMP,
+    Job,
+    Row,
+    Rule,
+    Sequencer,
+    Table2Cfg,
+    executed_costs,
+    jobs,
+    tune,
+    work,
+)
+
+FILE = table2.ROOT / "cfg" / "table2.toml"
+TINY = (
+    *(
+        "trials=1",
+        "tuning_seeds=[7]",
+        "early=[3, 1]",
+        "durations=[2, 4]",
+        "thresholds=[-95.0, 30.0]",
+        "untuned=2",
+    ),
+    *(
+        "sampling.horizon=4",
+        "sampling.knots=2",
+        "sampling.samples=3",
+        "sampling.worlds=3",
+        "sampling.elites=2",
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory) -> tuple[str, ...]:
+    path = write_random_policy(tmp_path_factory.mktemp("policies") / "random.onnx", hidden=(8,))
+    flip = (*SHORT, f"task.foot={path}", f"task.hand={path}")
+    return (*TINY, *(f"flip.{item}" for item in flip))
+
+
+@pytest.fixture(scope="module")
+def cfg(settings) -> Table2Cfg:
+    return study_cfg(FILE, Table2Cfg, settings)
+
+
+def test_rules_by_hand():
+    """Pitch -90 in the foot stand, +90 in the handstand; the command comes at step 5."""
+    rules = [Rule(2, 3), Rule(0, 2), Rule(1, threshold=0.0), Rule(-9, 3)]
+    follow, seen = Sequencer(rules, 5), []
+    for k in range(9):
+        x = (FOOTSTAND if k < 7 else HANDSTAND).state().expand(4, -1)
+        seen.append(follow(x, k).tolist())
+    foot, jump, hand = FOOT, JUMP, HAND
+    columns = list(zip(*seen, strict=True))
+    assert columns[0] == (*[foot] * 3, *[jump] * 3, *[hand] * 3)
+    assert columns[1] == (*[foot] * 5, *[jump] * 2, *[hand] * 2)
+    assert columns[2] == (*[foot] * 4, *[jump] * 3, *[hand] * 2), "over the threshold from step 7 on"
+    assert columns[3] == (foot,) * 9
+
+
+def test_tuning_costs_are_those_of_a_run(cfg):
+    """All rules at once in one simulator, or one by one in closed loop: the same cost."""
+    rules = [Rule(3, 2), Rule(1, 4), Rule(2, threshold=-95.0)]
+    costs = executed_costs(flip_task(cfg.flip.task, seed=7, threads=1), cfg.flip, rules, 7)
+    for rule, cost in zip(rules, costs.tolist(), strict=True):
+        task, follow = flip_task(cfg.flip.task, seed=7, threads=1), Sequencer([rule], cfg.flip.task.command)
+
+        def choose(x: torch.Tensor, k: int, task=task, follow=follow) -> str:
+            return str(task.modes.names[int(follow(x[None], k))])
+
+        control = chosen(task.modes, choose)
+        assert run(control, task.cost, cfg.flip, 7).cost == pytest.approx(cost, rel=1e-9)
+    assert tune(cfg, rules) == rules[int(costs.argmin())]
+
+
+def test_bad_settings():
+    with pytest.raises(
+        ValueError, match=r"tuning_seeds \(101,\) must not be among the trials' own, 100 to 104"
+    ):
+        Table2Cfg(tuning_seeds=(101,))
+
+
+def test_the_program(cfg, settings, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(study, "run_all", lambda do, todo, *_: map(do, todo))
+    assert table2.main(table2.Args(out=tmp_path, set=settings)) == 0
+    found = json.loads((tmp_path / "table2.json").read_text(encoding="utf-8"))
+    assert list(found) == list(CONTROLLERS)
+    for values in found.values():
+        assert (values["trials"], values["handstand"]) == (1, 0)
+        assert math.isfinite(values["cost_mean"])
+        assert values["cost_std"] == 0
+    assert found["mppi"]["control_steps"] == 3 * 4, "a re-plan at every step"
+    assert (
+        found["untuned"]["control_steps"]
+        <= found["sequence"]["control_steps"]
+        < found["ours"]["control_steps"]
+    )
+    rows = study.read(tmp_path / "table2.csv", Row)
+    assert [row.job for row in rows] == jobs(cfg)
+    for name in ("visited", "modes", "cost"):
+        assert (tmp_path / f"table2_{name}.png").stat().st_size > 0
+    assert len((tmp_path / "table2.md").read_text(encoding="utf-8").splitlines()) == 2 + len(CONTROLLERS)
+    assert CONTROLLERS["pitch"] in capsys.readouterr().out
+    (folder,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    rules = table2.tuned(cfg, folder / "rules.json", None)
+    assert rules["untuned"] == Rule(0, 2)
+    again = partial(work, cfg, rules, folder / "runs")(Job("sequence", 100))
+    before = next(row for row in rows if row.job == again.job)
+    assert (again.cost, again.control_steps) == (before.cost, before.control_steps)
