@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,49 +35,46 @@ class ContactCfg:
     stuck: float = 0.25
 
 
-class ContactDetector:
-    """Hysteresis on each foot's force, its zero tracked, and on its joint torques as the fallback.
+class FootContact:
+    """One foot: hysteresis on its force, the sensor's zero tracked, and on its joint torques as the fallback.
 
     Attributes:
-        contact: which feet carry load, (4,) bool.
-        stuck: whose sensors are not believed, (4,) bool.
+        contact: whether the foot carries load.
+        stuck: whether its sensor is not believed.
     """
 
     def __init__(self, cfg: ContactCfg):
         self.cfg = cfg
-        self.contact = np.zeros(4, dtype=bool)
-        self.stuck = np.zeros(4, dtype=bool)
-        self._by_force = np.zeros(4, dtype=bool)
-        self._by_load = np.zeros(4, dtype=bool)
-        self._zero = np.zeros(4)
-        self._doubt = np.zeros(4)
+        self.contact = self.stuck = False
+        self._by_force = self._by_load = False
+        self._zero = self._doubt = 0.0
 
-    def update(self, force: Array, load: Array, dt: float) -> None:
-        """One tick.
+    def update(self, force: float, load: float, dt: float) -> bool:
+        """One tick; whether the foot carries load.
 
         Args:
-            force: sensor readings [counts], (4,); NaN: none came.
-            load: normal force by joint torques [N], (4,); NaN: unknown.
+            force: sensor reading [counts]; NaN: none came.
+            load: normal force by joint torques [N]; NaN: unknown.
             dt: since the tick before [s].
         """
-        cfg = self.cfg
-        came = np.isfinite(force)
-        above = np.where(came, force - self._zero, 0.0)
-        self._by_force = np.where(came, above > np.where(self._by_force, cfg.off, cfg.on), self._by_force)
-        known = np.isfinite(load)
-        load = np.where(known, load, 0.0)
-        carries, hangs = known & (load > cfg.load_on), known & (load < cfg.load_off)
-        self._by_load = carries | (self._by_load & ~hangs)
+        cfg, came = self.cfg, math.isfinite(force)
+        # what compares with NaN is false: an unknown load neither carries nor hangs
+        carries, hangs = load > cfg.load_on, load < cfg.load_off
+        self._by_load = carries or (self._by_load and not hangs)
+        above = force - self._zero
+        if came:
+            self._by_force = above > (cfg.off if self._by_force else cfg.on)
 
-        # a sensor that contradicts clear torques for long is stuck; agreeing as long mends it
-        wrong = (carries & ~self._by_force) | (hangs & self._by_force) | ~came
-        self._doubt = np.clip(self._doubt + np.where(wrong, dt, -0.5 * dt), 0.0, 2.0 * cfg.stuck)
-        self.stuck = np.where(self.stuck, self._doubt > 0.0, self._doubt > cfg.stuck)
-        self.contact = np.where(self.stuck | ~came, self._by_load, self._by_force)
+        # a sensor that contradicts clear torques for long is stuck; agreeing mends it, half as fast
+        wrong = not came or (hangs if self._by_force else carries)
+        self._doubt = min(max(self._doubt + (dt if wrong else -0.5 * dt), 0.0), 2.0 * cfg.stuck)
+        self.stuck = self._doubt > (0.0 if self.stuck else cfg.stuck)
+        self.contact = self._by_load if self.stuck or not came else self._by_force
 
-        idle = came & hangs & ~self.contact
-        share = np.where(idle, min(1.0, dt / cfg.zero_time), 0.0)
-        self._zero = np.clip(self._zero + share * above, -cfg.zero_limit, cfg.zero_limit)
+        if came and hangs and not self.contact:
+            zero = self._zero + above * min(1.0, dt / cfg.zero_time)
+            self._zero = min(max(zero, -cfg.zero_limit), cfg.zero_limit)
+        return self.contact
 
 
 def normal_load(jacobian: Array, tau: Array, up: Array) -> Array:

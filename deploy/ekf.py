@@ -49,6 +49,7 @@ GRAVITY = 9.81
 _I3, _EYE = np.eye(3), np.eye(N)
 _DIAGONAL = np.arange(N)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
+_ROWS = np.array([[3 * leg, 3 * leg + 1, 3 * leg + 2, 12 + leg] for leg in range(4)])
 
 
 def foot(leg: int) -> slice:
@@ -111,7 +112,13 @@ class Ekf:
         self.p = np.zeros((4, 3))
         self.stands = np.zeros(4, dtype=bool)
         self.P = np.eye(N)
-        self._F, self._H, self._Q = np.eye(N), np.zeros((16, N)), np.zeros(N)
+        self._F, self._Q = np.eye(N), np.zeros(N)
+        # residuals: rows 3 i of foot i's place, then the heights of the four
+        self._e, self._H = np.zeros(16), np.zeros((16, N))
+        self._PHt, self._S = np.zeros((N, 16)), np.zeros((16, 16))
+        # views: the feet's own blocks of S, and its last four diagonal entries
+        self._blocks = np.einsum("iaib->iab", self._S[:12, :12].reshape(4, 3, 4, 3))
+        self._heights = np.einsum("ii->i", self._S[12:, 12:])
         for leg in range(4):
             self._H[3 * leg : 3 * leg + 3, R] = _I3
             self._H[3 * leg : 3 * leg + 3, foot(leg)] = -_I3
@@ -155,8 +162,8 @@ class Ekf:
         Q[V] = (cfg.acc * dt) ** 2 + (cfg.jerk * hidden) ** 2
         Q[R] = Q[3] * dt * dt / 3.0
         Q[BW], Q[BF] = cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
-        way = cfg.roll * FOOT_RADIUS
-        Q[15:] = np.repeat(self.stands * (cfg.foot**2 * dt + way * way * (roll * roll).sum(1)), 3)
+        way = (cfg.roll * FOOT_RADIUS) ** 2 * (roll * roll).sum(1)
+        Q[15:].reshape(4, 3)[:] = (self.stands * (cfg.foot**2 * dt + way))[:, None]
         self.P = F @ self.P @ F.T
         self.P[_DIAGONAL, _DIAGONAL] += Q
 
@@ -170,11 +177,6 @@ class Ekf:
         self.p[:, 1] -= FOOT_RADIUS * self.stands * roll[:, 0]
         self.q = so3.multiply(self.q, so3.quaternion(phi))
         self.C = so3.matrix(self.q)
-
-    def foot_noise(self, jacobian: Array) -> Array:
-        """Covariance of each foot's place by kinematics in the world frame [m^2], (4, 3, 3)."""
-        spread = self.C @ jacobian
-        return self.cfg.joint**2 * (spread @ spread.transpose(0, 2, 1)) + self.cfg.kinematics**2 * _I3
 
     def anchor(self, leg: int, s: Array, noise: Array) -> None:
         """A foot touches down: its position becomes what kinematics say.
@@ -202,51 +204,38 @@ class Ekf:
         self.P[at, at] = _I3
         self.stands[leg] = False
 
-    def foot_jacobian(self, s: Array) -> Array:
-        """Jacobian of the residuals by the error: rows 3 i of foot i's, then the four heights, (16, 27).
-
-        Residuals are measured minus expected: 0 - (C s_i + r - p_i), and rho - p_i,z.
+    def innovation(self, s: Array, noise: Array) -> tuple[Array, Array]:
+        """What kinematics say of the anchored feet against what the filter does.
 
         Args:
-            s: foot centres from the IMU in the body frame [m], (4, 3).
-        """
-        self._H[:12, PHI] = -skew(s @ self.C.T).reshape(12, 3)
-        return self._H
-
-    def correct(self, use: Flags, s: Array, noise: Array, ground: float, gate: float) -> Flags:
-        """One update with those feet that pass the gate.
-
-        Args:
-            use: feet to try, all of them anchored, (4,) bool.
             s: foot centres from the IMU in the body frame [m], (4, 3).
             noise: their covariances in the world frame [m^2], (4, 3, 3).
-            ground: variance of the ground's height under a foot in this update [m^2]; inf: unknown.
-            gate: a foot is left out when the squared Mahalanobis distance of its residual is beyond it.
 
         Returns:
-            Which feet were used, (4,) bool.
+            Residual 0 - (C s_i + r - p_i) of each foot [m], (4, 3), and its covariance [m^2], (4, 3, 3).
         """
-        used = use.copy()
-        if not used.any():
-            return used
-        H = self.foot_jacobian(s)
-        e = np.empty(16)
-        e[:12] = (self.p - self.r - s @ self.C.T).reshape(12)
-        e[12:] = FOOT_RADIUS - self.p[:, 2]
-        PHt = self.P @ H.T
-        S = H @ PHt
-        for leg in range(4):
-            at = slice(3 * leg, 3 * leg + 3)
-            S[at, at] += noise[leg]
-            if used[leg]:
-                used[leg] = e[at] @ np.linalg.solve(S[at, at], e[at]) < gate
-        S[_HEIGHT, _HEIGHT] += ground if np.isfinite(ground) else 1.0
-        heights = used & np.isfinite(ground)
-        rows = np.flatnonzero(np.concatenate([np.repeat(used, 3), heights]))
-        if len(rows) == 0:
-            return used
-        self._update(e[rows], H[rows], PHt[:, rows], S[np.ix_(rows, rows)])
-        return used
+        arm = s @ self.C.T
+        self._e[:12] = (self.p - self.r - arm).reshape(12)
+        self._e[12:] = FOOT_RADIUS - self.p[:, 2]
+        self._H[:12, PHI] = skew(-arm).reshape(12, 3)
+        np.matmul(self.P, self._H.T, out=self._PHt)
+        np.matmul(self._H, self._PHt, out=self._S)
+        self._blocks += noise
+        return self._e[:12].reshape(4, 3), self._blocks
+
+    def correct(self, used: Flags, ground: float | None) -> None:
+        """One update with the last innovation of some feet.
+
+        Args:
+            used: which, (4,) bool.
+            ground: variance of the ground's height under a foot in this update [m^2]; None: unknown.
+        """
+        legs = np.flatnonzero(used)
+        rows = _ROWS[legs, : 3 if ground is None else 4].reshape(-1)
+        if ground is not None:
+            self._heights += ground
+        S = self._S[rows[:, None], rows]
+        self._update(self._e[rows], self._H[rows], self._PHt[:, rows], S)
 
     def observe_force(self, acc: Array, noise: Array) -> None:
         """One update with the mean specific force of a body that stands still: acc = b_f - C^T g.
@@ -282,6 +271,3 @@ class Ekf:
         self.v, self.r = self.v + d[V], self.r + d[R]
         self.bw, self.bf = self.bw + d[BW], self.bf + d[BF]
         self.p += d[15:].reshape(4, 3)
-
-
-_HEIGHT = np.arange(12, 16)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deploy import so3
-from deploy.contact import ContactCfg, ContactDetector, normal_load
+from deploy.contact import ContactCfg, FootContact, normal_load
 from deploy.ekf import BF, BW, GRAVITY, PHI, Ekf, Flags, NoiseCfg, R, V
 from deploy.estimate import Estimate
 from deploy.kinematics import FOOT_RADIUS, IMU, Legs, legs
@@ -16,8 +16,8 @@ from deploy.so3 import Array, skew
 
 _I3 = np.eye(3)
 _UP = np.array([0.0, 0.0, 1.0])
-# e_z x u, for rows u
-_LEVER = skew(_UP).T
+# rows w to rows -rho w x e_z
+_LEVER = FOOT_RADIUS * skew(_UP).T
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ class Estimator:
 
     Attributes:
         ekf: the Kalman ekf.
-        contacts: the contact detector.
+        detectors: contact detection of each foot.
+        contact: what it says, (4,) bool.
     """
 
     def __init__(self, cfg: EstimatorCfg | None = None):
@@ -103,13 +104,15 @@ class Estimator:
     def reset(self) -> None:
         """Forget everything; the next readings must come from a still stand."""
         self.ekf = Ekf(self.cfg.noise)
-        self.contacts = ContactDetector(self.cfg.contact)
+        self.detectors = [FootContact(self.cfg.contact) for _ in range(4)]
+        self.contact = np.zeros(4, dtype=bool)
         self._t = -math.inf
         self._still: list[Array] = []
         self._imu = np.full(6, np.nan)  # of the last good tick
         self._q, self._qd = np.full((4, 3), np.nan), np.zeros((4, 3))
         self._refused = np.zeros(4)  # for how long each foot has been left out [s]
         self._lost = 0.0
+        self._e, self._S = np.zeros((8, 3)), np.zeros((8, 3, 3))  # places, then contact points' velocities
         self._ready = False
         self._estimate: Estimate | None = None
 
@@ -149,7 +152,9 @@ class Estimator:
         gap = max(0.0, dt - self.cfg.period) if good else dt
         imu = 0.5 * (last + self._imu) if gap > 0.1 * self.cfg.period else self._imu
         self.ekf.predict(imu[:3], imu[3:], (leg.axis @ turned[:, :, None])[:, :, 0], dt, gap)
-        self.contacts.update(force, normal_load(leg.jacobian, tau, self.ekf.C[2]), dt)
+        load = normal_load(leg.jacobian, tau, self.ekf.C[2])
+        readings = zip(self.detectors, force.tolist(), load.tolist(), strict=True)
+        self.contact = np.array([foot.update(f, n, dt) for foot, f, n in readings])
         used = self._feet(leg, known, dt)
         self._estimate = self._output(used)
         return self._estimate
@@ -196,39 +201,45 @@ class Estimator:
         self._ready = True
 
     def _feet(self, leg: Legs, known: Flags, dt: float) -> Flags:
-        """Anchor, use and release feet; which were used, (4,) bool."""
-        cfg, ekf, contact = self.cfg, self.ekf, self.contacts.contact
-        s, noise = leg.foot - IMU, ekf.foot_noise(leg.jacobian)
-        still = self._slip(leg, s) < cfg.slip_gate
+        """Release, use and anchor feet; which were used, (4,) bool."""
+        cfg, ekf, contact = self.cfg, self.ekf, self.contact
         for i in range(4):
             if ekf.stands[i] and (not contact[i] or self._refused[i] > cfg.patience):
                 ekf.release(i)
-            if contact[i] and known[i] and still[i] and not ekf.stands[i]:
-                ekf.anchor(i, s[i], noise[i])
-        ground = cfg.noise.ground**2 * cfg.noise.ground_time / dt if cfg.flat else math.inf
-        used = ekf.correct(ekf.stands & known & still, s, noise, ground, cfg.gate)
-        self._refused = np.where(used | ~contact, 0.0, self._refused + dt)
 
-        self._lost = self._lost + dt if contact.any() and not used.any() else 0.0
+        s, spread = leg.foot - IMU, ekf.C @ leg.jacobian
+        gram = spread @ spread.transpose(0, 2, 1)
+        noise = ekf.cfg.joint**2 * gram + ekf.cfg.kinematics**2 * _I3
+        e, S = self._e, self._S
+        e[:4], S[:4] = ekf.innovation(s, noise)
+        e[4:] = self._slip(leg, s)
+        S[4:] = cfg.joint_speed**2 * gram + (ekf.P[V, V] + cfg.creep**2 * _I3)
+        distance = (e * np.linalg.solve(S, e[:, :, None])[:, :, 0]).sum(1)
+        still = known & (distance[4:] < cfg.slip_gate)
+        used: Flags = ekf.stands & still & (distance[:4] < cfg.gate)
+        if used.any():
+            ekf.correct(used, cfg.noise.ground**2 * cfg.noise.ground_time / dt if cfg.flat else None)
+        for i in range(4):
+            self._refused[i] = 0.0 if used[i] or not ekf.stands[i] else self._refused[i] + dt
+            if contact[i] and still[i] and not ekf.stands[i]:
+                ekf.anchor(i, s[i], noise[i])
+
+        self._lost = self._lost + dt if contact.any() and not ekf.stands.any() else 0.0
         if self._lost > cfg.lost:
             ekf.P[V, V] += cfg.lost_speed**2 * _I3
             self._lost = 0.0
         return used
 
     def _slip(self, leg: Legs, s: Array) -> Array:
-        r"""Squared Mahalanobis distance of each foot's contact point from rest, (4,).
+        r"""Velocity of each foot's contact point in the world frame [m/s], (4, 3).
 
         .. math:: u_i = v + C (w \times s_i + J_i \dot q_i) - \rho \, (C w_i) \times e_z
         """
-        cfg, ekf = self.cfg, self.ekf
-        w = self._imu[:3] - ekf.bw
-        qd = self._qd[:, :, None]
+        C, qd = self.ekf.C, self._qd[:, :, None]
+        w = self._imu[:3] - self.ekf.bw
         rel = s @ skew(w).T + (leg.jacobian @ qd)[:, :, 0]
         shank = w + (leg.axis @ qd)[:, :, 0]
-        u = ekf.v + rel @ ekf.C.T + FOOT_RADIUS * (shank @ ekf.C.T) @ _LEVER
-        spread = ekf.C @ leg.jacobian
-        S = cfg.joint_speed**2 * (spread @ spread.transpose(0, 2, 1)) + ekf.P[V, V] + cfg.creep**2 * _I3
-        return np.asarray((u[:, None] @ np.linalg.solve(S, u[:, :, None]))[:, 0, 0])
+        return np.asarray(self.ekf.v + rel @ C.T + shank @ (C.T @ _LEVER))
 
     def _output(self, used: Flags) -> Estimate:
         """The estimate of the base, from that of the IMU."""
@@ -244,7 +255,7 @@ class Estimator:
             ekf.C,
             ekf.bw,
             ekf.bf,
-            self.contacts.contact,
+            self.contact,
             used,
             ekf.P.copy(),
             self.cfg.noise.gyro,
