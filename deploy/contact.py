@@ -1,13 +1,14 @@
-"""Which feet carry load: foot force sensors, and joint torques where a sensor is stuck."""
+r"""Which feet carry load: foot force sensors, and joint torques where a sensor is stuck.
+
+The torques tell the normal force of the ground, legs taken as massless:
+
+.. math:: n = -e_z^T C J^{-T} \tau
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-
-import numpy as np
-
-from deploy.so3 import Array
 
 
 @dataclass(frozen=True)
@@ -75,17 +76,3 @@ class FootContact:
             zero = self._zero + above * min(1.0, dt / cfg.zero_time)
             self._zero = min(max(zero, -cfg.zero_limit), cfg.zero_limit)
         return self.contact
-
-
-def normal_load(jacobian: Array, tau: Array, up: Array) -> Array:
-    r"""Normal force of the ground on each foot by its joint torques, inertia left out [N], (4,).
-
-    .. math:: f = -J^{-T} \tau, \quad n = e_z^T C f
-
-    Args:
-        jacobian: of the feet [m/rad], (4, 3, 3).
-        tau: joint torques [N m], (12,).
-        up: world z in the body frame, (3,).
-    """
-    force = np.linalg.solve(jacobian.transpose(0, 2, 1), -tau.reshape(4, 3, 1))
-    return np.asarray(force[:, :, 0] @ up)

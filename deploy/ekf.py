@@ -71,7 +71,8 @@ class NoiseCfg:
         turn: of the angular acceleration that a gap between readings hides [rad/s^2].
         jerk: of the change of acceleration that it hides [m/s^3].
         foot: of a standing foot's random walk [m/sqrt(s)]: yielding ground, creep.
-        roll: of the same walk for a turning shank, relative to the way that it rolls.
+        roll: of the walk that comes with the shank's turning [m/sqrt(rad)]: wrong links and joint zeros,
+            feet that are not quite spheres.
         joint: of a joint angle that changes from reading to reading [rad].
         kinematics: of a foot's place by kinematics, likewise [m].
         ground: of the ground's height at a foothold [m].
@@ -86,8 +87,8 @@ class NoiseCfg:
     acc_bias: float = 0.03
     turn: float = 20.0
     jerk: float = 100.0
-    foot: float = 0.004
-    roll: float = 0.1
+    foot: float = 0.0015
+    roll: float = 0.0045
     joint: float = 0.002
     kinematics: float = 0.0005
     ground: float = 0.01
@@ -162,8 +163,8 @@ class Ekf:
         Q[V] = (cfg.acc * dt) ** 2 + (cfg.jerk * hidden) ** 2
         Q[R] = Q[3] * dt * dt / 3.0
         Q[BW], Q[BF] = cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
-        way = (cfg.roll * FOOT_RADIUS) ** 2 * (roll * roll).sum(1)
-        Q[15:].reshape(4, 3)[:] = (self.stands * (cfg.foot**2 * dt + way))[:, None]
+        rolled = np.sqrt((roll * roll).sum(1))
+        Q[15:].reshape(4, 3)[:] = (self.stands * (cfg.foot**2 * dt + cfg.roll**2 * rolled))[:, None]
         self.P = F @ self.P @ F.T
         self.P[_DIAGONAL, _DIAGONAL] += Q
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deploy import so3
-from deploy.contact import ContactCfg, FootContact, normal_load
+from deploy.contact import ContactCfg, FootContact
 from deploy.ekf import BF, BW, GRAVITY, PHI, Ekf, Flags, NoiseCfg, R, V
 from deploy.estimate import Estimate
 from deploy.kinematics import FOOT_RADIUS, IMU, Legs, legs
@@ -35,8 +35,8 @@ class StartCfg:
 
     time: float = 0.25
     speed: float = 0.1
-    rate: float = 0.003
-    acc: float = 0.1
+    rate: float = 0.005
+    acc: float = 0.2
     max_rate: float = 0.5
     max_acc: float = 2.0
 
@@ -106,13 +106,13 @@ class Estimator:
         self.ekf = Ekf(self.cfg.noise)
         self.detectors = [FootContact(self.cfg.contact) for _ in range(4)]
         self.contact = np.zeros(4, dtype=bool)
-        self._t = -math.inf
+        self._t = self._good = -math.inf  # of the last tick, of the last with an IMU
         self._still: list[Array] = []
         self._imu = np.full(6, np.nan)  # of the last good tick
         self._q, self._qd = np.full((4, 3), np.nan), np.zeros((4, 3))
         self._refused = np.zeros(4)  # for how long each foot has been left out [s]
         self._lost = 0.0
-        self._e, self._S = np.zeros((8, 3)), np.zeros((8, 3, 3))  # places, then contact points' velocities
+        self._A, self._b = np.zeros((3, 4, 3, 3)), np.zeros((3, 4, 3))
         self._ready = False
         self._estimate: Estimate | None = None
 
@@ -133,12 +133,12 @@ class Estimator:
         """
         if not t > self._t:
             return self._estimate
-        if t - self._t > self.cfg.max_gap:
+        if t - self._t > self.cfg.max_gap or (self._ready and t - self._good > self.cfg.max_gap):
             self.reset()
         dt, self._t = t - self._t, t
-        last, good = self._imu, self._readable(gyro, acc)
+        last, good, blind = self._imu, self._readable(gyro, acc), t - self._good
         if good:
-            self._imu = np.concatenate([gyro, acc])
+            self._imu, self._good, blind = np.concatenate([gyro, acc]), t, blind - self.cfg.period
         angles, speeds = q.reshape(4, 3), qd.reshape(4, 3)
         known: Flags = np.asarray(np.isfinite(angles + speeds).all(1))
         turned = np.where(known[:, None], angles - self._q, 0.0)
@@ -149,13 +149,9 @@ class Estimator:
             return self._estimate
 
         leg = legs(self._q.reshape(12))
-        gap = max(0.0, dt - self.cfg.period) if good else dt
-        imu = 0.5 * (last + self._imu) if gap > 0.1 * self.cfg.period else self._imu
-        self.ekf.predict(imu[:3], imu[3:], (leg.axis @ turned[:, :, None])[:, :, 0], dt, gap)
-        load = normal_load(leg.jacobian, tau, self.ekf.C[2])
-        readings = zip(self.detectors, force.tolist(), load.tolist(), strict=True)
-        self.contact = np.array([foot.update(f, n, dt) for foot, f, n in readings])
-        used = self._feet(leg, known, dt)
+        imu = 0.5 * (last + self._imu) if blind > 0.1 * self.cfg.period else self._imu
+        self.ekf.predict(imu[:3], imu[3:], (leg.axis @ turned[:, :, None])[:, :, 0], dt, max(0.0, blind))
+        used = self._feet(leg, tau, force, known, dt)
         self._estimate = self._output(used)
         return self._estimate
 
@@ -166,7 +162,7 @@ class Estimator:
         return bool(np.abs(gyro).max() < cfg.max_gyro and np.abs(acc).max() < cfg.max_acc)
 
     def _start(self, good: bool) -> None:
-        """Collect the still stand; at its end, set the ekf."""
+        """Collect the still stand; at its end, set the filter."""
         cfg, ekf = self.cfg.start, self.ekf
         if good and np.isfinite(self._q).all():
             self._still.append(self._imu)
@@ -185,44 +181,47 @@ class Estimator:
 
         # all but unknown before the update with the mean specific force, which ties the tilt to the bias
         noise, variance = self.cfg.noise, np.ones(len(ekf.P))
-        variance[PHI], variance[V], variance[R] = (
-            (1.0, 1.0, 1e-8),
-            cfg.speed**2,
-            (1e-8, 1e-8, noise.ground**2),
-        )
+        variance[PHI], variance[V] = (1.0, 1.0, 1e-8), cfg.speed**2
+        variance[R] = 1e-8, 1e-8, noise.ground**2
         variance[BW], variance[BF] = noise.gyro_bias**2, noise.acc_bias**2
         ekf.P = np.diag(variance)
         white = np.repeat([noise.gyro**2, noise.acc**2], 3)
         sway = np.repeat([cfg.rate**2, cfg.acc**2], 3)
-        # what moves more than noise is a stand that sways, for the whole time as far as we know
-        error = white / len(readings) + np.maximum(spread - white, 0.0) + sway
+        # what moves more than noise is a stand that sways, slower than the mean could tell
+        error = white / len(readings) + 4.0 * np.maximum(spread - white, 0.0) + sway
         ekf.observe_rate(mean[:3], error[:3])
         ekf.observe_force(mean[3:], error[3:])
         self._ready = True
 
-    def _feet(self, leg: Legs, known: Flags, dt: float) -> Flags:
-        """Release, use and anchor feet; which were used, (4,) bool."""
-        cfg, ekf, contact = self.cfg, self.ekf, self.contact
-        for i in range(4):
-            if ekf.stands[i] and (not contact[i] or self._refused[i] > cfg.patience):
-                ekf.release(i)
-
+    def _feet(self, leg: Legs, tau: Array, force: Array, known: Flags, dt: float) -> Flags:
+        """Tell contacts, use feet, anchor and release them; which were used, (4,) bool."""
+        cfg, ekf = self.cfg, self.ekf
         s, spread = leg.foot - IMU, ekf.C @ leg.jacobian
         gram = spread @ spread.transpose(0, 2, 1)
-        noise = ekf.cfg.joint**2 * gram + ekf.cfg.kinematics**2 * _I3
-        e, S = self._e, self._S
-        e[:4], S[:4] = ekf.innovation(s, noise)
-        e[4:] = self._slip(leg, s)
-        S[4:] = cfg.joint_speed**2 * gram + (ekf.P[V, V] + cfg.creep**2 * _I3)
-        distance = (e * np.linalg.solve(S, e[:, :, None])[:, :, 0]).sum(1)
-        still = known & (distance[4:] < cfg.slip_gate)
-        used: Flags = ekf.stands & still & (distance[:4] < cfg.gate)
+        noise = cfg.noise.joint**2 * gram + cfg.noise.kinematics**2 * _I3
+        # three systems a foot, solved at once: its place, its contact point's velocity, its force
+        A, b = self._A, self._b
+        b[0], A[0] = ekf.innovation(s, noise)
+        b[1], A[1] = self._slip(leg, s), cfg.joint_speed**2 * gram + (ekf.P[V, V] + cfg.creep**2 * _I3)
+        b[2], A[2] = tau.reshape(4, 3), leg.jacobian.transpose(0, 2, 1)
+        x = np.linalg.solve(A, b[..., None])[..., 0]
+        place, speed = (b[:2] * x[:2]).sum(2)
+        readings = zip(self.detectors, force.tolist(), (x[2] @ -ekf.C[2]).tolist(), strict=True)
+        self.contact = contact = np.array([foot.update(f, load, dt) for foot, f, load in readings])
+
+        still = contact & known & (speed < cfg.slip_gate)
+        used: Flags = ekf.stands & still & (place < cfg.gate)
         if used.any():
             ekf.correct(used, cfg.noise.ground**2 * cfg.noise.ground_time / dt if cfg.flat else None)
         for i in range(4):
-            self._refused[i] = 0.0 if used[i] or not ekf.stands[i] else self._refused[i] + dt
-            if contact[i] and still[i] and not ekf.stands[i]:
-                ekf.anchor(i, s[i], noise[i])
+            if not ekf.stands[i]:
+                self._refused[i] = 0.0
+                if still[i]:
+                    ekf.anchor(i, s[i], noise[i])
+                continue
+            self._refused[i] = 0.0 if used[i] else self._refused[i] + dt
+            if not contact[i] or self._refused[i] > cfg.patience:
+                ekf.release(i)
 
         self._lost = self._lost + dt if contact.any() and not ekf.stands.any() else 0.0
         if self._lost > cfg.lost:

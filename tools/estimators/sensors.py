@@ -77,9 +77,7 @@ class Readings:
 
     def __iter__(self) -> Iterator[tuple[float, Array, Array, Array, Array, Array, Array]]:
         """Arguments of an estimator's update, frame by frame."""
-        return zip(
-            self.t.tolist(), self.gyro, self.acc, self.q, self.qd, self.tau, self.force, strict=True
-        )
+        return zip(self.t.tolist(), self.gyro, self.acc, self.q, self.qd, self.tau, self.force, strict=True)
 
 
 def sense(log: Log, seed: int, cfg: SensorCfg | None = None) -> Readings:
@@ -95,18 +93,19 @@ def sense(log: Log, seed: int, cfg: SensorCfg | None = None) -> Readings:
     gyro = log.gyro + gyro_bias + cfg.gyro * rng.normal(size=(n, 3))
     acc = log.acc + acc_bias + cfg.acc * rng.normal(size=(n, 3))
     q = log.x[:, 7:19] + rng.uniform(-cfg.zero, cfg.zero, 12)
-    q = cfg.step * np.round(q / cfg.step)
+    q = cfg.step * np.rint(q / cfg.step)
     qd = log.x[:, 25:] + cfg.speed * rng.normal(size=(n, 12))
     tau = log.tau + cfg.torque * rng.normal(size=(n, 12))
     scale = 1.0 + rng.uniform(-cfg.scale, cfg.scale, 4)
     force = scale * log.force + walk(cfg.offset, cfg.drift, 4) + cfg.force * rng.normal(size=(n, 4))
-    force = np.round(np.maximum(force, 0.0))
+    force = np.rint(np.maximum(force, 0.0))
 
     row = _arrivals(n, cfg, rng)
     parts = [part[row] for part in (gyro, acc, q, qd, tau, force)]
     for frame in np.flatnonzero(rng.random(len(row)) < cfg.nan):
         parts[rng.integers(len(parts))][frame] = np.nan
-    return Readings(row, log.t[row], *parts, gyro_bias, acc_bias)
+    gyro, acc, q, qd, tau, force = parts
+    return Readings(row, log.t[row], gyro, acc, q, qd, tau, force, gyro_bias, acc_bias)
 
 
 def _arrivals(n: int, cfg: SensorCfg, rng: np.random.Generator) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from deploy.kinematics import legs
 from hmc.cfg import load
 from hmc.go2 import model as go2
 from hmc.go2.policy import Policy
@@ -104,6 +105,10 @@ class Recorder:
             mujoco.mj_forward(self.model, self.data)
             self.rows.append(np.concatenate([[self.data.time], imu, self._rest()]))
 
+    def restart(self) -> None:
+        """Forget what was recorded; the motion goes on."""
+        self.rows, self.data.time = [], 0.0
+
     def _rest(self) -> Array:
         """Torques (12,), foot forces (4,), state (37,), slip (4,)."""
         data, force, wrench = self.data, np.zeros(4), np.zeros(6)
@@ -171,15 +176,19 @@ def _gait(model: mujoco.MjModel, seconds: float, trot: bool) -> Log:
     x = np.zeros(37)
     x[2], x[3], x[7:19] = go2.HOME_HEIGHT, 1.0, home
     recorder = Recorder(model, x, home)
+    recorder.run(home, 2.0)
+    recorder.restart()
     recorder.run(home, min(1.0, seconds))
-    lift, stride, rate = 0.35, 0.12, 2.0
+    lift, stride, rate, weight = 0.35, 0.06, 2.5, 100.0
     while (time := recorder.data.time) < seconds - 1e-9:
-        target = home.reshape(4, 3).copy()
-        for leg, phase in enumerate((0.0, 0.5, 0.5, 0.0)) if trot else ():
+        target, leg = home.reshape(4, 3).copy(), legs(recorder.x[7:19])
+        for i, phase in enumerate((0.0, 0.5, 0.5, 0.0)) if trot else ():
             angle = 2.0 * math.pi * ((rate * (time - 1.0) + phase) % 1.0)
             up = lift * max(0.0, math.sin(angle))
-            target[leg, 1] += up + stride * math.cos(angle)
-            target[leg, 2] -= 2.0 * up
+            target[i, 1] += up + stride * math.cos(angle)
+            target[i, 2] -= 2.0 * up
+            if up == 0.0:  # the servo is soft: two legs would sag under the weight
+                target[i] -= weight / 2.0 / go2.KP * leg.jacobian[i, 2]
         recorder.run(target.reshape(12), SENSORS)
     return recorder.log(bool(go2.vertical(torch.from_numpy(recorder.x)[None, 3:7])[0, 2] > 0.9))
 
