@@ -33,6 +33,7 @@ Feet that do not stand are kept out: their covariance is 1 m^2, uncorrelated.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,11 +60,15 @@ def foot(leg: int) -> slice:
 
 @dataclass(frozen=True)
 class NoiseCfg:
-    """Standard deviations. Those of the sensors are the ones that the simulated sensors have.
+    """Standard deviations, all of them of one axis.
+
+    Those of readings are the simulated sensors'. Walks of the biases are half as large again as theirs, and
+    those of the feet were chosen so that the errors are as large as the filter says (docs/estimator.md).
 
     Attributes:
         gyro: of a reading [rad/s].
         acc: of a reading [m/s^2].
+        scale: of a reading, relative to what it reads beyond rest: coning, timing, scale factors.
         gyro_walk: of the gyroscope's bias [rad/s/sqrt(s)].
         acc_walk: of the accelerometer's bias [m/s^2/sqrt(s)].
         gyro_bias: of the gyroscope's bias before the first reading [rad/s].
@@ -81,8 +86,9 @@ class NoiseCfg:
 
     gyro: float = 0.01
     acc: float = 0.1
-    gyro_walk: float = 1e-4
-    acc_walk: float = 1e-3
+    scale: float = 0.01
+    gyro_walk: float = 1.5e-4
+    acc_walk: float = 1.5e-3
     gyro_bias: float = 0.003
     acc_bias: float = 0.03
     turn: float = 20.0
@@ -117,9 +123,6 @@ class Ekf:
         # residuals: rows 3 i of foot i's place, then the heights of the four
         self._e, self._H = np.zeros(16), np.zeros((16, N))
         self._PHt, self._S = np.zeros((N, 16)), np.zeros((16, 16))
-        # views: the feet's own blocks of S, and its last four diagonal entries
-        self._blocks = np.einsum("iaib->iab", self._S[:12, :12].reshape(4, 3, 4, 3))
-        self._heights = np.einsum("ii->i", self._S[12:, 12:])
         for leg in range(4):
             self._H[3 * leg : 3 * leg + 3, R] = _I3
             self._H[3 * leg : 3 * leg + 3, foot(leg)] = -_I3
@@ -159,13 +162,15 @@ class Ekf:
         F = self.transition(w, f, roll, dt)
         cfg, Q = self.cfg, self._Q
         hidden = 0.5 * gap * dt
-        Q[PHI] = (cfg.gyro * dt) ** 2 + (cfg.turn * hidden) ** 2
-        Q[V] = (cfg.acc * dt) ** 2 + (cfg.jerk * hidden) ** 2
+        shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
+        Q[PHI] = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
+        Q[V] = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
         Q[R] = Q[3] * dt * dt / 3.0
         Q[BW], Q[BF] = cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
         rolled = np.sqrt((roll * roll).sum(1))
         Q[15:].reshape(4, 3)[:] = (self.stands * (cfg.foot**2 * dt + cfg.roll**2 * rolled))[:, None]
-        self.P = F @ self.P @ F.T
+        P = F @ self.P @ F.T
+        self.P = 0.5 * (P + P.T)
         self.P[_DIAGONAL, _DIAGONAL] += Q
 
         first, second = so3.integrals(phi)
@@ -221,8 +226,9 @@ class Ekf:
         self._H[:12, PHI] = skew(-arm).reshape(12, 3)
         np.matmul(self.P, self._H.T, out=self._PHt)
         np.matmul(self._H, self._PHt, out=self._S)
-        self._blocks += noise
-        return self._e[:12].reshape(4, 3), self._blocks
+        blocks: Array = np.einsum("iaib->iab", self._S[:12, :12].reshape(4, 3, 4, 3))  # a view
+        blocks += noise
+        return self._e[:12].reshape(4, 3), blocks
 
     def correct(self, used: Flags, ground: float | None) -> None:
         """One update with the last innovation of some feet.
@@ -234,7 +240,7 @@ class Ekf:
         legs = np.flatnonzero(used)
         rows = _ROWS[legs, : 3 if ground is None else 4].reshape(-1)
         if ground is not None:
-            self._heights += ground
+            self._S.reshape(-1)[12 * 17 :: 17] += ground  # on the diagonal
         S = self._S[rows[:, None], rows]
         self._update(self._e[rows], self._H[rows], self._PHt[:, rows], S)
 

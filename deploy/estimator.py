@@ -72,7 +72,7 @@ class EstimatorCfg:
     max_gap: float = 0.5
     gate: float = 16.3
     slip_gate: float = 16.3
-    creep: float = 0.03
+    creep: float = 0.035
     joint_speed: float = 0.05
     patience: float = 0.01
     lost: float = 0.05

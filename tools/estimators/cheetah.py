@@ -2,8 +2,8 @@
 
 G. Bledt et al., "MIT Cheetah 3: design and control of a robust, dynamic quadruped robot", IROS 2018:
 position, velocity and feet, measured by the feet's places, their speeds and the ground's height. The attitude
-comes from R. Mahony et al., "Nonlinear complementary filters on the special orthogonal group", TAC 2008, with the
-accelerometer trusted near 1 g only.
+comes from R. Mahony et al., "Nonlinear complementary filters on the special orthogonal group", TAC 2008, with
+the accelerometer trusted near 1 g only.
 """
 
 from __future__ import annotations

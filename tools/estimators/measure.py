@@ -117,8 +117,8 @@ def measure(
     motion: str,
     seconds: float,
     seed: int,
-    cfg: EstimatorCfg | None = None,
     filters: tuple[str, ...] = FILTERS,
+    cfg: EstimatorCfg | None = None,
 ) -> list[Score]:
     """Simulate one robot and run the filters on what its sensors say."""
     log = simulate(motion, seconds, seed)
