@@ -21,7 +21,7 @@ from tools.estimators.reference import Frame
 
 @dataclass(frozen=True)
 class CheetahCfg:
-    """Noise of the filter, as published, and gains of the attitude filter.
+    """Noise of the filter, published but for the speed's, and gains of the attitude filter.
 
     Attributes:
         p, v, foot: process noise, in the published scaling with dt.
@@ -35,10 +35,10 @@ class CheetahCfg:
     v: float = 0.02
     foot: float = 0.002
     place: float = 0.001
-    speed: float = 0.1
+    speed: float = 1.0
     height: float = 0.001
     suspect: float = 100.0
-    kp: float = 0.5
+    kp: float = 1.0
     ki: float = 0.05
     band: float = 2.0
 

@@ -38,7 +38,7 @@ class InvariantCfg:
     acc_walk: float = 1e-3
     gyro_bias: float = 0.003
     acc_bias: float = 0.03
-    contact: float = 0.005
+    contact: float = 0.0015
     joint: float = 0.002
 
 
