@@ -83,4 +83,4 @@ class Stand:
 
 def stand(name: str, **settings: object) -> Stand:
     """A still stand by name."""
-    return Stand(*STANDS[name], **settings)  # type: ignore[arg-type]
+    return Stand(*STANDS[name], **settings)

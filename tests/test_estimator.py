@@ -50,7 +50,7 @@ def test_the_state_is_mujocos():
 def test_biases_are_found_where_they_can_be(name):
     bias = np.array([0.004, -0.003, 0.002])
     robot = stand(name, gyro_bias=bias, acc_bias=0.04 * stand(name).C[2], noise=1.0)
-    e = robot.run(Estimator(), 3.0)
+    e = robot.run(Estimator(), 2.0)
     sigma = np.sqrt(np.diag(e.P)[9:15])
     np.testing.assert_array_less(np.abs(bias - e.gyro_bias), 3.5 * sigma[:3])
     across = np.abs(robot.C[2]) < 0.5  # rates that turn gravity; about the vertical only the feet tell
@@ -72,7 +72,7 @@ def test_wrong_velocity_and_attitude_are_mended(name):
     for leg in robot.feet:
         ekf.release(leg)  # an anchor would remember how the body stood
     assert math.degrees(math.acos(ekf.C[2] @ robot.C[2])) > 5.0
-    e = robot.run(estimator, 4.0)
+    e = robot.run(estimator, 2.5)
     assert tilt(e, robot) < 0.6
     assert np.linalg.norm(e.velocity) < 0.02
 
@@ -228,13 +228,13 @@ def test_an_estimate_is_not_changed_by_later_ticks():
 
 
 def test_without_flat_ground_the_height_is_free():
-    free = stand("home", noise=1.0).run(Estimator(EstimatorCfg(flat=False)), 1.0)
-    tied = stand("home", noise=1.0).run(Estimator(), 1.0)
+    free = stand("home", noise=1.0).run(Estimator(EstimatorCfg(flat=False)), 0.6)
+    tied = stand("home", noise=1.0).run(Estimator(), 0.6)
     assert tied.P[8, 8] < 0.9 * free.P[8, 8]
 
 
 @pytest.mark.parametrize(
-    ("motion", "seconds", "speed"), [("footstand", 3.0, 0.03), ("handstand", 3.0, 0.03), ("flip", 3.4, 0.06)]
+    ("motion", "seconds", "speed"), [("footstand", 2.0, 0.03), ("handstand", 2.0, 0.03), ("flip", 3.0, 0.06)]
 )
 def test_short_logs(motion, seconds, speed):
     log = simulate(motion, seconds, 7)

@@ -49,9 +49,9 @@ def draw(path: Path, seconds: float, seed: int) -> None:
     axes[1].semilogy(t, sigma, color="black", lw=0.8, label="ours, its own standard deviation")
     axes[1].set_ylim(1e-3, 1)
     labels = (
-        "forward velocity [m/s]",
+        "velocity along x [m/s]",
         "velocity error [m/s]",
-        "gravity direction [deg]",
+        "gravity error [deg]",
         "height error [mm]",
     )
     for axis, label in zip(axes, labels, strict=True):
