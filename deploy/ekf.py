@@ -47,9 +47,10 @@ Flags = NDArray[np.bool_]
 N = 27
 PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 GRAVITY = 9.81
-_I3, _EYE = np.eye(3), np.eye(N)
+_I3 = np.eye(3)
 _DIAGONAL = np.arange(N)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
+_ROLL = FOOT_RADIUS * _UP  # rows w to rho w x e_z
 _ROWS = np.array([[3 * leg, 3 * leg + 1, 3 * leg + 2, 12 + leg] for leg in range(4)])
 
 
@@ -178,9 +179,7 @@ class Ekf:
         self.r[2] -= 0.5 * GRAVITY * dt * dt
         self.v = self.v + self.C @ (first @ f) * dt
         self.v[2] -= GRAVITY * dt
-        # e_z is up: (rho roll) x e_z = rho (roll_y, -roll_x, 0)
-        self.p[:, 0] += FOOT_RADIUS * self.stands * roll[:, 1]
-        self.p[:, 1] -= FOOT_RADIUS * self.stands * roll[:, 0]
+        self.p += self.stands[:, None] * (roll @ _ROLL)
         self.q = so3.multiply(self.q, so3.quaternion(phi))
         self.C = so3.matrix(self.q)
 
@@ -268,10 +267,8 @@ class Ekf:
     def _update(self, e: Array, H: Array, PHt: Array, S: Array) -> None:
         """Kalman update with residual e = H error + noise, whose covariance is S = H P H^T + noise."""
         K = np.linalg.solve(S, PHt.T).T
-        # P - K S K^T, written so that it comes out symmetric; equal to Joseph's form for this K
-        A = _EYE - K @ H
-        self.P = A @ self.P @ A.T + K @ (S - H @ PHt) @ K.T
-        self.P = 0.5 * (self.P + self.P.T)
+        # equal to Joseph's form for this K; what rounding leaves of asymmetry, `predict` takes out
+        self.P = self.P - K @ PHt.T
         d = K @ e
         self.q = so3.multiply(so3.quaternion(d[PHI]), self.q)
         self.C = so3.matrix(self.q)

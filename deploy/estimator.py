@@ -16,6 +16,7 @@ from deploy.so3 import Array, skew
 
 _I3 = np.eye(3)
 _UP = np.array([0.0, 0.0, 1.0])
+_ALL: Flags = np.ones(4, dtype=bool)
 # rows w to rows -rho w x e_z
 _LEVER = FOOT_RADIUS * skew(_UP).T
 
@@ -140,10 +141,14 @@ class Estimator:
         if good:
             self._imu, self._good, blind = np.concatenate([gyro, acc]), t, blind - self.cfg.period
         angles, speeds = q.reshape(4, 3), qd.reshape(4, 3)
-        known: Flags = np.asarray(np.isfinite(angles + speeds).all(1))
-        turned = np.where(known[:, None], angles - self._q, 0.0)
-        self._q = np.where(known[:, None], angles, self._q)
-        self._qd = np.where(known[:, None], speeds, self._qd)
+        if math.isfinite(angles.sum() + speeds.sum()):
+            known, turned = _ALL, angles - self._q
+            self._q, self._qd = angles.copy(), speeds.copy()
+        else:
+            known = np.asarray(np.isfinite(angles + speeds).all(1))
+            turned = np.where(known[:, None], angles - self._q, 0.0)
+            self._q = np.where(known[:, None], angles, self._q)
+            self._qd = np.where(known[:, None], speeds, self._qd)
         if not self._ready:
             self._start(good)
             return self._estimate

@@ -9,6 +9,7 @@ Sources: offsets and link lengths are Unitree's, as published in MuJoCo Menageri
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +22,9 @@ FOOT_BACK = 0.002  # the foot's centre lies behind the shank's axis
 FOOT_RADIUS = 0.022
 IMU = np.array([-0.02557, 0.0, 0.04232])
 
-_END = np.array([1.0, 1.0, -1.0, -1.0])
-_SIDE = np.array([1.0, -1.0, 1.0, -1.0])
-_X, _Y, _OUT = HIP_X * _END, HIP_Y * _SIDE, HIP_LENGTH * _SIDE
+_X = (HIP_X, HIP_X, -HIP_X, -HIP_X)
+_Y = (HIP_Y, -HIP_Y, HIP_Y, -HIP_Y)
+_OUT = (HIP_LENGTH, -HIP_LENGTH, HIP_LENGTH, -HIP_LENGTH)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,21 +56,15 @@ def legs(q: Array) -> Legs:
     Args:
         q: joint angles [rad], (12,).
     """
-    joint = q.reshape(4, 3).T.copy()
-    joint[2] += joint[1]
-    (ch, ca, cb), (sh, sa, sb) = np.cos(joint), np.sin(joint)
-    shin_x, shin_d = -LINK * sb - FOOT_BACK * cb, LINK * cb - FOOT_BACK * sb
-    x, d = shin_x - LINK * sa, shin_d + LINK * ca
-    y, z = ch * _OUT + sh * d, sh * _OUT - ch * d
-
-    foot = np.empty((4, 3))
-    foot[:, 0], foot[:, 1], foot[:, 2] = x + _X, y + _Y, z
-    jacobian = np.zeros((4, 3, 3))
-    jacobian[:, 1, 0], jacobian[:, 2, 0] = -z, y
-    jacobian[:, 0, 1], jacobian[:, 1, 1], jacobian[:, 2, 1] = -d, sh * x, -ch * x
-    jacobian[:, 0, 2], jacobian[:, 1, 2], jacobian[:, 2, 2] = -shin_d, sh * shin_x, -ch * shin_x
-    axis = np.zeros((4, 3, 3))
-    axis[:, 0, 0] = 1.0
-    axis[:, 1, 1:] = ch[:, None]
-    axis[:, 2, 1:] = sh[:, None]
-    return Legs(foot, jacobian, axis)
+    foot, jacobian, axis = [], [], []
+    # plain arithmetic: an array operation on four numbers takes as long as all that a leg needs
+    for (h, a, b), hip_x, hip_y, out in zip(q.reshape(4, 3).tolist(), _X, _Y, _OUT, strict=True):
+        ch, sh, ca, sa = math.cos(h), math.sin(h), math.cos(a), math.sin(a)
+        cb, sb = math.cos(a + b), math.sin(a + b)
+        shin_x, shin_d = -LINK * sb - FOOT_BACK * cb, LINK * cb - FOOT_BACK * sb
+        x, d = shin_x - LINK * sa, shin_d + LINK * ca
+        y, z = ch * out + sh * d, sh * out - ch * d
+        foot.append((hip_x + x, hip_y + y, z))
+        jacobian.append(((0.0, -d, -shin_d), (-z, sh * x, sh * shin_x), (y, -ch * x, -ch * shin_x)))
+        axis.append(((1.0, 0.0, 0.0), (0.0, ch, ch), (0.0, sh, sh)))
+    return Legs(np.array(foot), np.array(jacobian), np.array(axis))
