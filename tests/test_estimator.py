@@ -50,7 +50,7 @@ def test_the_state_is_mujocos():
 def test_biases_are_found_where_they_can_be(name):
     bias = np.array([0.004, -0.003, 0.002])
     robot = stand(name, gyro_bias=bias, acc_bias=0.04 * stand(name).C[2], noise=1.0)
-    e = robot.run(Estimator(), 1.5)
+    e = robot.run(Estimator(), 2.0)
     sigma = np.sqrt(np.diag(e.P)[9:15])
     np.testing.assert_array_less(np.abs(bias - e.gyro_bias), 3.5 * sigma[:3])
     across = np.abs(robot.C[2]) < 0.5  # rates that turn gravity; about the vertical only the feet tell

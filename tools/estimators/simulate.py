@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 
@@ -171,7 +170,7 @@ def _rows(recorder: Recorder) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _gait(model: mujoco.MjModel, seconds: float, trot: bool) -> Log:
-    """Stand on four legs; or, after a second, trot: diagonal pairs swing forward at 2 Hz."""
+    """Stand on four legs, or trot after a second: diagonal pairs step at 2.5 Hz, feet sliding."""
     home = go2.HOME.double().numpy()
     x = np.zeros(37)
     x[2], x[3], x[7:19] = go2.HOME_HEIGHT, 1.0, home
@@ -204,6 +203,3 @@ def _flip(model: mujoco.MjModel, seconds: float, seed: int) -> Log:
     hold(recorder, modes["jump"], jump, before)
     hold(recorder, modes["hand"], round(seconds / go2.DT) - before - jump, before + jump)
     return recorder.log(bool(HANDSTAND.held(torch.from_numpy(recorder.x)[None])))
-
-
-Simulator = Callable[[str, float, int], Log]
