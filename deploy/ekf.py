@@ -148,14 +148,18 @@ class Ekf:
         F[15:, BW] = (lift @ (dt * C)).reshape(12, 3)
         return F
 
-    def predict(self, gyro: Array, acc: Array, turn: Array, dt: float, gap: float = 0.0) -> None:
+    def predict(
+        self, gyro: Array, acc: Array, turn: Array, dt: float, gap: float = 0.0, jump: Array | None = None
+    ) -> None:
         """Move on by dt.
 
         Args:
             gyro, acc: readings over the step [rad/s], [m/s^2], (3,).
             turn: rotation of each shank relative to the base over the step, in the body frame [rad], (4, 3).
             dt: [s].
-            gap: how much of dt no reading covers [s].
+            gap: how much of dt no reading covers, or for how long none has come [s].
+            jump: difference of the readings before and after the gap, gyroscope's then accelerometer's, (6,):
+                what lies between is known to about half of it.
         """
         w, f = gyro - self.bw, acc - self.bf
         phi = w * dt
@@ -166,7 +170,11 @@ class Ekf:
         shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
         Q[PHI] = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
         Q[V] = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
-        Q[R] = Q[3] * dt * dt / 3.0
+        if jump is not None:
+            between = (0.5 * gap * jump) ** 2
+            Q[PHI] += between[:3]
+            Q[V] += between[3:]
+        Q[R] = Q[V] * (dt * dt / 3.0)
         Q[BW], Q[BF] = cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
         rolled = np.sqrt((roll * roll).sum(1))
         Q[15:].reshape(4, 3)[:] = (self.stands * (cfg.foot**2 * dt + cfg.roll**2 * rolled))[:, None]

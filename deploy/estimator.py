@@ -154,8 +154,13 @@ class Estimator:
             return self._estimate
 
         leg = legs(self._q.reshape(12))
-        imu = 0.5 * (last + self._imu) if blind > 0.1 * self.cfg.period else self._imu
-        self.ekf.predict(imu[:3], imu[3:], (leg.axis @ turned[:, :, None])[:, :, 0], dt, max(0.0, blind))
+        imu, jump = self._imu, None
+        if good and blind > 0.1 * self.cfg.period:
+            # the gap gets the mean of the readings around it, the rest of the step its own
+            jump = imu - last
+            imu = imu - 0.5 * min(1.0, blind / dt) * jump
+        turn = (leg.axis @ turned[:, :, None])[:, :, 0]
+        self.ekf.predict(imu[:3], imu[3:], turn, dt, max(0.0, blind), jump)
         used = self._feet(leg, tau, force, known, dt)
         self._estimate = self._output(used)
         return self._estimate

@@ -129,6 +129,16 @@ def test_steps_of_any_length_agree():
     np.testing.assert_allclose(minus(one, many)[:9], 0.0, atol=1e-12)
 
 
+def test_a_gap_between_unlike_readings_widens_the_covariance_by_half_of_what_they_differ():
+    plain, wide = random_filter(), random_filter()
+    gyro, acc, jump = np.zeros(3), -DOWN, np.array([1.0, 2.0, 3.0, 40.0, 50.0, 60.0])
+    plain.predict(gyro, acc, np.zeros((4, 3)), 0.004, 0.002)
+    wide.predict(gyro, acc, np.zeros((4, 3)), 0.004, 0.002, jump)
+    more = np.diag(wide.P - plain.P)
+    np.testing.assert_allclose(more[:6], (0.001 * jump) ** 2, atol=1e-12)
+    np.testing.assert_array_equal(more[9:], 0.0)
+
+
 def test_a_standing_foot_rolls_and_a_hanging_one_does_not():
     ekf = Ekf(NoiseCfg())
     ekf.stands[:] = [True, False, True, False]
