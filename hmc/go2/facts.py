@@ -38,7 +38,7 @@ FOOT_RADIUS = 0.022
 FOOT_BACK = 0.002  # the foot's centre lies behind the shank's axis
 HIP_CENTRE = 0.08  # of the hip's sphere, sideways from its joint
 CALF_END = (0.01, 0.17)  # where the shin's capsule ends: forward and down from the knee
-IMU = (-0.02557, 0.0, 0.04232)  # in the base frame
+IMU = (-0.02557, 0.0, 0.04232)  # in the base frame, as in Unitree's go2_description
 
 DT = 0.02  # s, the control step that policies are trained at
 SUBSTEPS = 4  # physics steps a control step
