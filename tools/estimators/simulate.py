@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -18,8 +19,9 @@ from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import flip_task, policy_path
 from hmc.modes import Mode
-from tools.closed_loop import ROOT, RunCfg, disturbed_start
+from tools.closed_loop import RunCfg, disturbed_start
 
+ROOT = Path(__file__).resolve().parents[2]
 Array = NDArray[np.float64]
 PHYSICS, SENSORS = 0.001, 0.002  # s
 MOTIONS = ("stand", "trot", "footstand", "handstand", "flip")
