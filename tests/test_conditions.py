@@ -249,6 +249,7 @@ def test_a_policy_is_measured_under_its_conditions(tmp_path, monkeypatch):
     policy = Policy(write_random_policy(tmp_path / "random.onnx", hidden=(4,)))
     starts = Starts(HANDSTAND, StartsCfg(stance=1.0, home=0.0), torch.device("cpu"), unlocked=True)
     monkeypatch.setattr(evaluate, "SETTLE", 0.1)
+    monkeypatch.setitem(evaluate.PROTOCOLS, "push", (0.06, 0.1))
     seen: dict[float, list[torch.Tensor]] = {0.0: [], 0.4: []}
     for speed, states in seen.items():
         torch.manual_seed(3)
@@ -263,7 +264,7 @@ def test_a_policy_is_measured_under_its_conditions(tmp_path, monkeypatch):
         good, found = evaluate.measured(policy, starts, "push", 5, conditions, 1)
         monkeypatch.setattr(Robots, "step", step)
         assert good.shape == (5,)
-        assert found.held.shape == (5 + round(5.0 / go2.DT), 5)
+        assert found.held.shape == (5 + 3 + 5, 5)
     gap = [(a - b).norm(dim=1) for a, b in zip(*seen.values(), strict=True)]
     assert not torch.stack(gap[:5]).any()
     assert (gap[5] > 0.2).all()
