@@ -70,6 +70,11 @@ def test_import_alone_loads_nothing() -> None:
     assert loaded("import hmc, hmc.cfg, hmc.go2.facts", ("torch", "numpy", "mujoco", *HEAVY)) == []
 
 
+def test_the_estimator_needs_numpy_alone() -> None:
+    """It runs in the robot's real-time process."""
+    assert loaded("import deploy.estimator", ("torch", "mujoco", "onnxruntime", "hmc", *HEAVY)) == []
+
+
 def test_import_prints_nothing() -> None:
     ran = subprocess.run([sys.executable, "-c", "import hmc"], cwd=ROOT, capture_output=True, text=True)
     assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")

@@ -1,0 +1,78 @@
+r"""Which feet carry load: foot force sensors, and joint torques where a sensor is stuck.
+
+The torques tell the normal force of the ground, legs taken as massless:
+
+.. math:: n = -e_z^T C J^{-T} \tau
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ContactCfg:
+    """Thresholds of contact.
+
+    Sources: 20 counts is what published Go2 estimators take; a hysteresis follows Leg-KILO's on the Go2.
+
+    Attributes:
+        on: force reading above its zero at which a foot begins to carry [counts, about 1 N].
+        off: below which it ends, likewise.
+        load_on: normal force by joint torques at which a foot surely carries [N].
+        load_off: below which it surely does not [N].
+        zero_time: how fast a sensor's zero follows its reading while the foot surely hangs [s].
+        zero_limit: how far the zero may move [counts].
+        stuck: how long sensor and torques may disagree before the sensor counts as stuck [s].
+    """
+
+    on: float = 20.0
+    off: float = 12.0
+    load_on: float = 25.0
+    load_off: float = 12.0
+    zero_time: float = 0.5
+    zero_limit: float = 20.0
+    stuck: float = 0.25
+
+
+class FootContact:
+    """One foot: hysteresis on its force, the sensor's zero tracked, and on its joint torques as the fallback.
+
+    Attributes:
+        contact: whether the foot carries load.
+        stuck: whether its sensor is not believed.
+    """
+
+    def __init__(self, cfg: ContactCfg):
+        self.cfg = cfg
+        self.contact = self.stuck = False
+        self._by_force = self._by_load = False
+        self._zero = self._doubt = 0.0
+
+    def update(self, force: float, load: float, dt: float) -> bool:
+        """One tick; whether the foot carries load.
+
+        Args:
+            force: sensor reading [counts]; NaN: none came.
+            load: normal force by joint torques [N]; NaN: unknown.
+            dt: since the tick before [s].
+        """
+        cfg, came = self.cfg, math.isfinite(force)
+        # what compares with NaN is false: an unknown load neither carries nor hangs
+        carries, hangs = load > cfg.load_on, load < cfg.load_off
+        self._by_load = carries or (self._by_load and not hangs)
+        above = force - self._zero
+        if came:
+            self._by_force = above > (cfg.off if self._by_force else cfg.on)
+
+        # a sensor that contradicts clear torques for long is stuck; agreeing mends it, half as fast
+        wrong = not came or (hangs if self._by_force else carries)
+        self._doubt = min(max(self._doubt + (dt if wrong else -0.5 * dt), 0.0), 2.0 * cfg.stuck)
+        self.stuck = self._doubt > (0.0 if self.stuck else cfg.stuck)
+        self.contact = self._by_load if self.stuck or not came else self._by_force
+
+        if came and hangs and not self.contact:
+            zero = self._zero + above * min(1.0, dt / cfg.zero_time)
+            self._zero = min(max(zero, -cfg.zero_limit), cfg.zero_limit)
+        return self.contact

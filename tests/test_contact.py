@@ -1,0 +1,78 @@
+"""Contact of a foot: hysteresis, a zero that drifts, a sensor that is stuck."""
+
+from __future__ import annotations
+
+import math
+
+from deploy.contact import ContactCfg, FootContact
+
+DT = 0.002
+CFG = ContactCfg()
+
+
+def feed(foot: FootContact, force: float, load: float, seconds: float) -> list[bool]:
+    return [foot.update(force, load, DT) for _ in range(round(seconds / DT))]
+
+
+def test_hysteresis():
+    foot = FootContact(CFG)
+    middle = 0.5 * (CFG.on + CFG.off)
+    assert not foot.update(middle, math.nan, DT)
+    assert foot.update(CFG.on + 1, math.nan, DT)
+    assert foot.update(middle, math.nan, DT)
+    assert not foot.update(CFG.off - 1, math.nan, DT)
+    assert not foot.update(middle, math.nan, DT)
+
+
+def test_a_drifting_zero_is_followed_while_the_foot_hangs():
+    foot = FootContact(CFG)
+    for k in range(5000):
+        assert not foot.update(18.0 * k / 5000, 0.0, DT)
+    assert not foot.update(CFG.on + 2.0, 0.0, DT), "what reads 22 now is 4 above its zero"
+    assert foot.update(CFG.on + 20.0, 75.0, DT)
+
+
+def test_the_zero_does_not_follow_a_load():
+    foot = FootContact(CFG)
+    assert all(feed(foot, 30.0, 75.0, 5.0))
+
+
+def test_a_sensor_stuck_at_zero_hands_over_to_the_torques():
+    foot = FootContact(CFG)
+    seen = feed(foot, 0.0, 75.0, 1.0)
+    assert not seen[0]
+    assert seen.index(True) * DT <= CFG.stuck + 2 * DT
+    assert foot.stuck
+    assert not foot.update(0.0, 0.0, DT), "and the torques tell of the lift-off too"
+
+
+def test_a_sensor_stuck_at_a_load_hands_over_to_the_torques():
+    foot = FootContact(CFG)
+    feed(foot, 75.0, 75.0, 0.5)
+    assert not foot.stuck
+    seen = feed(foot, 75.0, 0.0, 1.0)
+    assert seen.index(False) * DT <= CFG.stuck + 2 * DT
+    assert foot.stuck
+
+
+def test_a_mended_sensor_is_believed_again():
+    foot = FootContact(CFG)
+    feed(foot, 0.0, 75.0, 1.0)
+    assert foot.stuck
+    feed(foot, 75.0, 75.0, 2.0)
+    assert not foot.stuck
+
+
+def test_a_swing_with_torques_of_its_own_is_no_contact():
+    """In the air a leg's inertia asks for torque, for less than the time that makes a sensor stuck."""
+    foot = FootContact(CFG)
+    assert not any(feed(foot, 0.0, 60.0, 0.8 * CFG.stuck))
+    assert not foot.stuck
+
+
+def test_no_reading_leaves_it_to_the_torques():
+    foot = FootContact(CFG)
+    feed(foot, 75.0, 75.0, 0.1)
+    assert foot.update(math.nan, 75.0, DT)
+    assert not foot.update(math.nan, 0.0, DT)
+    assert foot.update(75.0, 75.0, DT)

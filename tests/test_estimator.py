@@ -1,0 +1,270 @@
+"""The estimator on exact stands, under faults, and on short simulated logs."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from deploy import so3
+from deploy.estimate import Estimate
+from deploy.estimator import Estimator, EstimatorCfg
+from deploy.kinematics import legs
+from tests.legged import DT, STANDS, Stand, stand
+from tools.estimators.measure import consistency, gates, outputs, play, truth
+from tools.estimators.sensors import sense
+from tools.estimators.simulate import simulate
+
+
+def tilt(estimate: Estimate, robot: Stand) -> float:
+    """Angle between the estimated and the true gravity direction [deg]."""
+    return math.degrees(math.acos(min(1.0, float(-estimate.gravity @ robot.C[2]))))
+
+
+@pytest.mark.parametrize("name", STANDS)
+def test_an_exact_stand_is_known_exactly(name):
+    robot = stand(name)
+    e = robot.run(Estimator(), 1.0)
+    assert tilt(e, robot) < 1e-4
+    assert e.position[2] == pytest.approx(robot.height, abs=2e-3)
+    np.testing.assert_allclose(e.velocity, 0.0, atol=1e-6)
+    np.testing.assert_allclose(e.C, robot.C, atol=1e-6)
+    assert e.contact.tolist() == [leg in robot.feet for leg in range(4)]
+    assert e.used.tolist() == e.contact.tolist()
+
+
+def test_the_state_is_mujocos():
+    robot = stand("footstand", gyro_bias=np.array([0.001, 0.0, 0.0]))
+    e = robot.run(Estimator(), 0.5)
+    np.testing.assert_array_equal(e.x[:3], e.position)
+    np.testing.assert_array_equal(so3.matrix(e.x[3:7]), e.C)
+    np.testing.assert_array_equal(e.x[7:19], robot.q)
+    np.testing.assert_allclose(e.x[19:22], e.C @ e.velocity_body, atol=1e-12)
+    np.testing.assert_allclose(e.x[22:25], robot.gyro_bias - e.gyro_bias, atol=1e-12)
+    np.testing.assert_array_equal(e.x[25:], 0.0)
+
+
+@pytest.mark.parametrize("name", STANDS)
+def test_biases_are_found_where_they_can_be(name):
+    bias = np.array([0.004, -0.003, 0.002])
+    robot = stand(name, gyro_bias=bias, acc_bias=0.04 * stand(name).C[2], noise=1.0)
+    e = robot.run(Estimator(), 1.5)
+    sigma = np.sqrt(np.diag(e.P)[9:15])
+    np.testing.assert_array_less(np.abs(bias - e.gyro_bias), 3.5 * sigma[:3])
+    across = np.abs(robot.C[2]) < 0.5  # rates that turn gravity; about the vertical only the feet tell
+    assert (np.abs(bias - e.gyro_bias)[across] < 0.002).all()
+    assert e.acc_bias @ robot.C[2] == pytest.approx(0.04, abs=0.02)
+    assert tilt(e, robot) < 0.3
+
+
+@pytest.mark.parametrize("name", STANDS)
+def test_wrong_velocity_and_attitude_are_mended(name):
+    robot, estimator = stand(name, noise=1.0), Estimator()
+    robot.run(estimator, 0.5)
+    ekf = estimator.ekf
+    ekf.v = ekf.v + np.array([0.3, -0.2, 0.1])
+    ekf.q = so3.multiply(so3.quaternion(np.radians([4.0, -4.0, 0.0])), ekf.q)
+    ekf.C = so3.matrix(ekf.q)
+    ekf.P[:3, :3] += 0.1**2 * np.diag([1.0, 1.0, 0.0])
+    ekf.P[3:6, 3:6] += 0.3**2 * np.eye(3)
+    for leg in robot.feet:
+        ekf.release(leg)  # an anchor would remember how the body stood
+    assert math.degrees(math.acos(ekf.C[2] @ robot.C[2])) > 5.0
+    e = robot.run(estimator, 1.5)
+    assert tilt(e, robot) < 0.6
+    assert np.linalg.norm(e.velocity) < 0.02
+
+
+def test_a_duplicate_and_an_old_tick_change_nothing():
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    e = robot.run(estimator, 0.5)
+    P = estimator.ekf.P.copy()
+    for t in (e.t, e.t - 0.1, math.nan):
+        assert estimator.update(t=t, **robot.readings()) is e
+    np.testing.assert_array_equal(estimator.ekf.P, P)
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "acc", "q", "qd", "tau", "force"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_frame_without_numbers_does_no_harm(sensor, value):
+    robot, estimator = stand("handstand", noise=1.0), Estimator()
+    before = robot.run(estimator, 0.6)
+    e = robot.run(estimator, 0.02, **{sensor: np.full(len(robot.readings()[sensor]), value)})
+    assert np.isfinite(e.x).all()
+    assert np.isfinite(e.P).all()
+    np.testing.assert_allclose(e.velocity, before.velocity, atol=0.02)
+    assert tilt(robot.run(estimator, 0.2), robot) < 0.5
+
+
+def test_a_leg_without_joints_waits_and_the_others_go_on():
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    robot.run(estimator, 0.5)
+    q = robot.q.copy()
+    q[3:6] = math.nan
+    assert robot.run(estimator, DT, q=q).used.tolist() == [True, False, True, True]
+    assert robot.run(estimator, 2 * DT).used.all()
+
+
+def test_a_reading_beyond_the_sensors_range_is_left_out():
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    robot.run(estimator, 0.5)
+    e = robot.run(estimator, DT, gyro=np.array([0.0, 500.0, 0.0]), acc=np.array([0.0, 0.0, 9999.0]))
+    assert tilt(e, robot) < 0.5
+    assert np.linalg.norm(e.velocity) < 0.02
+
+
+def test_a_stall_widens_the_covariance_and_the_feet_mend_it():
+    robot, estimator = stand("footstand", noise=1.0), Estimator()
+    before = robot.run(estimator, 0.5)
+    robot.t += 0.1
+    during = robot.run(estimator, DT)
+    assert during.t - before.t == pytest.approx(0.102)
+    assert np.trace(during.tilt_covariance()) > np.trace(before.tilt_covariance())
+    e = robot.run(estimator, 0.5)
+    assert tilt(e, robot) < 0.6
+    assert np.linalg.norm(e.velocity) < 0.02
+
+
+def test_a_long_silence_begins_anew():
+    robot, estimator = stand("home"), Estimator()
+    robot.run(estimator, 0.5)
+    robot.t += 2.0
+    assert estimator.update(t=robot.t, **robot.readings()) is None
+    assert robot.run(estimator, 0.5).position[2] == pytest.approx(robot.height, abs=2e-3)
+
+
+def test_it_does_not_begin_on_a_turning_robot():
+    robot, estimator = stand("home"), Estimator()
+    for _ in range(300):
+        robot.t += DT
+        assert estimator.update(**{"t": robot.t, **robot.readings(), "gyro": np.array([0, 0, 2.0])}) is None
+    assert robot.run(estimator, 0.6) is not None
+
+
+def test_a_stuck_force_sensor():
+    """One sensor reads nothing from the start: the torques show the foot, and nothing else changes."""
+    robot, estimator = stand("handstand", noise=1.0), Estimator()
+    force = robot.readings()["force"]
+    force[0] = 0.0
+    assert robot.run(estimator, 0.4, force=force).contact.tolist() == [False, True, False, False]
+    e = robot.run(estimator, 0.6, force=force)
+    assert e.contact.tolist() == [True, True, False, False]
+    assert e.used.tolist() == e.contact.tolist()
+
+
+def test_a_slipping_foot_is_left_out():
+    """One foot of a stand slides at 0.2 m/s; its neighbours keep the velocity."""
+    for name in ("home", "handstand"):
+        robot, estimator = stand(name, noise=1.0), Estimator()
+        robot.run(estimator, 0.6)
+        leg, q = robot.feet[0], robot.q.copy()
+        way = robot.C.T @ np.array([0.0, 0.2, 0.0])  # sideways
+        uses, worst = 0, 0.0
+        for _ in range(100):
+            rate = np.linalg.solve(legs(q).jacobian[leg], way)
+            q[3 * leg : 3 * leg + 3] += rate * DT
+            qd = np.zeros(12)
+            qd[3 * leg : 3 * leg + 3] = rate
+            qd += 0.05 * robot.rng.normal(size=12)
+            e = robot.run(estimator, DT, q=q, qd=qd)
+            uses += int(e.used[leg])
+            worst = max(worst, float(np.linalg.norm(e.velocity)))
+        assert uses <= 10, "of 100 ticks"
+        assert worst < 0.03
+        robot.q = q
+        e = robot.run(estimator, 0.1)
+        assert e.used.tolist() == [i in robot.feet for i in range(4)], "it stands again"
+
+
+def test_flight_and_landing():
+    """Half a second without contact: the body is carried by the IMU, a thrown body's; then it stands."""
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    robot.run(estimator, 0.6)
+    none = {"force": np.zeros(4), "tau": np.zeros(12)}
+    start, speed = estimator.ekf.r[2], 0.5 * 9.81 * 0.5
+    estimator.ekf.v = np.array([0.0, 0.0, speed])
+    e = robot.run(estimator, 0.25, acc=np.zeros(3), **none)
+    assert not e.contact.any()
+    assert estimator.ekf.r[2] - start == pytest.approx(speed * 0.25 - 0.5 * 9.81 * 0.25**2, abs=0.02)
+    wide = np.trace(e.velocity_covariance())
+    e = robot.run(estimator, 0.24, acc=np.zeros(3), **none)
+    assert np.trace(e.velocity_covariance()) > wide
+    fall = 9.81 * 0.49 - speed
+    assert e.velocity[2] == pytest.approx(-fall, abs=0.05)
+    # the ground stops it within 20 ms, where it began
+    robot.run(estimator, 0.02, acc=np.array([0.0, 0.0, 9.81 + fall / 0.02]), **none)
+    e = robot.run(estimator, 0.3)
+    assert e.used.all()
+    assert np.linalg.norm(e.velocity) < 0.03
+    assert e.position[2] == pytest.approx(robot.height, abs=0.01)
+
+
+def test_a_lost_velocity_is_found_again():
+    """All feet contradict the filter, for a wrong and overconfident velocity: it widens and gives in."""
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    robot.run(estimator, 0.6)
+    estimator.ekf.v = np.array([2.0, 0.0, 0.0])
+    assert not robot.run(estimator, 0.02).used.any()
+    e = robot.run(estimator, 1.0)
+    assert e.used.all()
+    assert np.linalg.norm(e.velocity) < 0.05
+
+
+def test_the_same_readings_give_the_same_estimates_to_the_bit():
+    ends = [stand("footstand", noise=1.0, seed=3).run(Estimator(), 0.6) for _ in range(2)]
+    np.testing.assert_array_equal(ends[0].x, ends[1].x)
+    np.testing.assert_array_equal(ends[0].P, ends[1].P)
+
+
+def test_an_estimate_is_not_changed_by_later_ticks():
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    e = robot.run(estimator, 0.5)
+    kept = [np.copy(part) for part in (e.x, e.C, e.gyro_bias, e.acc_bias, e.contact, e.used, e.P)]
+    robot.run(estimator, 0.1)
+    for before, after in zip(kept, (e.x, e.C, e.gyro_bias, e.acc_bias, e.contact, e.used, e.P), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_without_flat_ground_the_height_is_free():
+    free = stand("home", noise=1.0).run(Estimator(EstimatorCfg(flat=False)), 0.6)
+    tied = stand("home", noise=1.0).run(Estimator(), 0.6)
+    assert tied.P[8, 8] < 0.9 * free.P[8, 8]
+
+
+@pytest.mark.parametrize(
+    ("motion", "seconds", "speed"), [("footstand", 2.0, 0.03), ("handstand", 2.0, 0.03), ("flip", 3.0, 0.06)]
+)
+def test_short_logs(motion, seconds, speed):
+    log = simulate(motion, seconds, 7)
+    readings = sense(log, 7)
+    estimates, _ = play(readings)
+    late = log.t[readings.row] > 1.0
+    out, true = outputs(estimates)[late], truth(log, readings.row)[late]
+    assert log.kept
+    assert np.sqrt(np.mean(np.sum((out[:, :3] - true[:, :3]) ** 2, 1))) < speed
+    assert np.degrees(np.arccos(np.clip((out[:, 3:6] * true[:, 3:6]).sum(1), -1, 1))).max() < 1.5
+    assert np.abs(out[:, 6] - true[:, 6]).max() < 0.03
+    velocity, gravity, biases = consistency(estimates, log, readings)
+    assert 0.3 < velocity < 9.0
+    assert gravity < 8.0
+    assert biases < 18.0
+    assert gates(estimates, log, readings)[0] < 0.05
+    for e in estimates[::100]:
+        if e is not None:
+            np.testing.assert_allclose(e.P, e.P.T, rtol=0, atol=1e-15)
+            assert np.linalg.eigvalsh(e.P).min() > 0
+
+
+def test_a_tick_is_fast():
+    """The bound on a quiet core is 0.4 ms; here only a tick that has become several times slower fails."""
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    robot.run(estimator, 0.4)
+    took = []
+    for _ in range(200):
+        readings = robot.readings()
+        began = time.thread_time()
+        estimator.update(t=robot.t, **readings)
+        took.append(time.thread_time() - began)
+    assert np.median(took) < 2e-3
