@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,38 @@ from hmc.sim.base import Sim
 from hmc.start import Vector, make_start
 from hmc.task import Task
 from hmc.trace import Trace
+
+
+@dataclass(frozen=True)
+class SearchCfg:
+    """The search at each control step.
+
+    Attributes:
+        samples: switches drawn a batch.
+        order: of the draws, see `hmc.plan`.
+        pairs: further draws beside each batch, into a mode and on to a third.
+        moves: further draws beside each batch that move a stretch of the schedule.
+        draws: switches that a tick's search may draw.
+        control_steps: control steps that it may roll out.
+    """
+
+    samples: int = 16
+    order: str = "tails"
+    pairs: int = 8
+    moves: int = 0
+    draws: int = 16
+    control_steps: int = 8000
+
+    def options(self) -> dict[str, Any]:
+        """Arguments of `Receding`."""
+        budget = Budget(draws=self.draws, control_steps=self.control_steps)
+        return {
+            "samples": self.samples,
+            "order": self.order,
+            "pairs": self.pairs,
+            "moves": self.moves,
+            "budget": budget,
+        }
 
 
 @dataclass(frozen=True, eq=False)

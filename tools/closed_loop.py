@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hmc import Budget, ModeSet, Receding, Task
+from hmc import ModeSet, Receding, Task
 from hmc.cfg import load
 from hmc.cost import Cost
 from hmc.go2.conditions import Conditions, NoiseCfg, Robots
@@ -22,28 +22,8 @@ from hmc.go2.observe import pitch
 from hmc.go2.stages import Stages, judge
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import FlipCfg
+from hmc.receding import SearchCfg
 from hmc.running import Running
-
-
-@dataclass(frozen=True)
-class SearchCfg:
-    """The search at each control step.
-
-    Attributes:
-        samples: switches drawn a batch.
-        order: of the draws, see `hmc.plan`.
-        pairs: further draws beside each batch, into a mode and on to a third.
-        moves: further draws beside each batch that move a stretch of the schedule.
-        draws: switches that a tick's search may draw.
-        control_steps: control steps that it may roll out.
-    """
-
-    samples: int = 16
-    order: str = "tails"
-    pairs: int = 8
-    moves: int = 0
-    draws: int = 16
-    control_steps: int = 8000
 
 
 @dataclass(frozen=True)
@@ -150,7 +130,7 @@ def disturbed_start(cfg: StartCfg, seed: int) -> tuple[Tensor, Tensor]:
 
 def planned(cfg: RunCfg, task: Task, seed: int) -> Controller:
     """The planner: searches at every control step and runs the first step's mode."""
-    loop = Receding(task, seed=seed, schedule=["foot"] * task.horizon, **search_options(cfg.search))
+    loop = Receding(task, seed=seed, schedule=["foot"] * task.horizon, **cfg.search.options())
 
     def act(x: Tensor, u: Tensor, snapshot: Tensor | None) -> Action:
         tick = loop.tick(x, u, snapshot)
@@ -181,18 +161,6 @@ def chosen(modes: ModeSet, choose: Callable[[Tensor, int], str]) -> Controller:
         return Action(action, name, {"control_steps": spent})
 
     return act
-
-
-def search_options(cfg: SearchCfg) -> dict[str, Any]:
-    """Arguments of `Receding`."""
-    budget = Budget(draws=cfg.draws, control_steps=cfg.control_steps)
-    return {
-        "samples": cfg.samples,
-        "order": cfg.order,
-        "pairs": cfg.pairs,
-        "moves": cfg.moves,
-        "budget": budget,
-    }
 
 
 def same_model(cfg: FlipCfg) -> bool:

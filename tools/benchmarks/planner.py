@@ -163,7 +163,7 @@ def _ticks(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
         task,
         schedule=["foot"] * task.horizon,
         k=max(0, cfg.task.command - 5),
-        **closed_loop.search_options(cfg.search),
+        **cfg.search.options(),
     )
     times, used, naive = [], 0, 0
     for _ in range(args.ticks):
