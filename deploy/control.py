@@ -18,6 +18,7 @@ from deploy.policy import Policy
 from deploy.remote import unpack
 from deploy.safety import Body, Envelope, Inputs, Machine, Phase, limited
 from deploy.settings import DeployCfg, EnvelopeCfg, RampCfg
+from deploy.slots import STATE
 from deploy.so3 import Array
 from hmc.go2 import facts
 
@@ -45,6 +46,8 @@ class Control:
         target: joint targets commanded last [rad], (12,).
         asked: tick from which the handstand is wanted; -1 while it is not.
         planner: whether the planner has been heard of.
+        wait: what has to come before the robot may be started; "" for nothing.
+        situation: value of the state's slot, of the last tick with modes.
 
     Args:
         cfg: settings.
@@ -59,7 +62,8 @@ class Control:
         self.state: RobotState | None = None
         self.estimate: Estimate | None = None
         self.target: Array = np.full(JOINTS, np.nan)
-        self.planner = False
+        self.planner, self.wait = False, ""
+        self.situation = np.zeros((), STATE)
         self._first = -1  # ms of tick 0
         self._envelope = Envelope()
         self._entered = 0  # ms of the phase's entry
@@ -84,6 +88,8 @@ class Control:
             0.001 * ms, state.gyro, state.acc, state.q, state.dq, state.tau, state.foot_force
         )
         fault = self._fault or self.checks.fault(now) or self._outside(state)
+        if self.phase == Phase.PASSIVE:
+            fault = fault or self.wait
         self._step(Inputs(unpack(state.remote).buttons, fault, self._posed(), self._settled(), self.planner))
         if self._first < 0:
             self._first = ms
@@ -102,6 +108,11 @@ class Control:
         """Something outside is wrong."""
         self._fault = self._fault or fault
         self._step(Inputs(fault=self._fault))
+
+    @property
+    def due_ms(self) -> int:
+        """When the last tick was due, by the robot's clock [ms]."""
+        return self._first + self.k * TICK
 
     @property
     def command(self) -> bytes | None:
@@ -133,8 +144,7 @@ class Control:
             return
         try:
             if phase == Phase.HYBRID:
-                assert self.estimate is not None
-                wanted, kp, kd = self.performer.act(self.k, self.estimate.x, self.target), facts.KP, facts.KD
+                wanted, kp, kd = self._perform(), facts.KP, facts.KD
             else:
                 assert self._ramp is not None
                 wanted, kp, kd = self._ramped(), self._ramp.kp, self._ramp.kd
@@ -143,6 +153,22 @@ class Control:
             self.fail(str(error))
             return
         self._frame = self._encode(self.target, kp, kd)
+
+    def _perform(self) -> Array:
+        """What the plan's mode wants; what a planner has to know is taken down before."""
+        performer, estimate, now = self.performer, self.estimate, self.situation
+        assert estimate is not None
+        performer.take_over(self.k)
+        now["k"], now["x"], now["u"], now["asked"], now["running"] = (
+            self.k,
+            estimate.x,
+            self.target,
+            self.asked,
+            1,
+        )
+        now["mode"], now["entered"], now["anchor"] = performer.mode, performer.entered, performer.anchor
+        now["plan"] = performer.plan.number if performer.plan else 0
+        return performer.act(self.k, estimate.x, self.target)
 
     def _ramped(self) -> Array:
         """Where the slow motion is now; its speed is zero at both ends."""
@@ -212,9 +238,7 @@ class Control:
         return NAMES[mode], (envelope.foot, envelope.jump, envelope.hand)[mode], since
 
     def _encode(self, q: Array, kp: float, kd: float) -> bytes:
-        return encode_command(
-            MotorCommand(q, _ZERO, _ZERO, np.full(JOINTS, kp), np.full(JOINTS, kd), _FOC)
-        )
+        return encode_command(MotorCommand(q, _ZERO, _ZERO, np.full(JOINTS, kp), np.full(JOINTS, kd), _FOC))
 
 
 def uncertainty(estimate: Estimate) -> tuple[float, float]:

@@ -1,9 +1,9 @@
-"""Runs, tick by tick, the mode that the current plan names: policies closed loop, the jump as it was planned."""
+"""Runs, tick by tick, the mode that the current plan names: policies, and the jump as it was planned."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -91,14 +91,13 @@ class Performer:
         self._next = plan
 
     def act(self, k: int, x: Array, u: Array) -> Array:
-        """Joint targets of tick k [rad], (12,).
+        """Joint targets of tick k [rad], (12,); `take_over` goes before.
 
         Args:
             k: tick.
             x: state, (37,).
             u: targets commanded last [rad], (12,).
         """
-        self._take_over(k)
         mode = self._choose(k)
         if mode != self.mode:
             self.mode, self.entered, self.anchor = mode, k, anchor_of(x)
@@ -109,16 +108,17 @@ class Performer:
             return self.plan.u[k - self.plan.begin]
         return self._policies[mode].act(x, u, self.anchor)
 
-    def _take_over(self, k: int) -> None:
+    def take_over(self, k: int) -> None:
+        """Make the plan that has come the one that runs, if its time has come by tick k."""
         plan = self._next
         if plan is None or k < plan.begin:
             return
         self._next = None
         before = [self._ran.get(tick, NONE) for tick in range(plan.begin - 1, k)]
-        if before != [plan.running, *plan.modes[: k - plan.begin]]:
-            self.counts["stale"] += 1
-        elif k - plan.begin >= self.cfg.expires:
+        if k - plan.begin >= self.cfg.expires:
             self.counts["late"] += 1
+        elif before != [plan.running, *plan.modes[: k - plan.begin]]:
+            self.counts["stale"] += 1
         else:
             self.counts["taken"] += 1
             self.plan = plan
@@ -126,12 +126,25 @@ class Performer:
     def _choose(self, k: int) -> int:
         """The mode of tick k."""
         plan = self.plan
-        if plan is None:
-            return FOOT
-        i = k - plan.begin
-        if self.mode == JUMP:
-            over = i >= len(plan.modes) or k - self.entered >= self.cfg.jump
-            # a plan that is too old may end the jump, but only in the stance that jumps end in
-            wanted = HAND if over else plan.modes[i]
-            return wanted if i < self.cfg.expires or wanted == JUMP else HAND
-        return plan.modes[i] if i < min(self.cfg.expires, len(plan.modes)) else self.mode
+        begin, modes = (0, ()) if plan is None else (plan.begin, plan.modes)
+        return due(self.cfg, begin, modes, k, self.mode, self.entered)
+
+
+def due(cfg: PlanCfg, begin: int, modes: Sequence[int], k: int, mode: int, entered: int) -> int:
+    """The mode that a plan makes run at a tick; the planner reckons with the same.
+
+    Args:
+        cfg: rules.
+        begin: tick of the plan's first step.
+        modes: of its steps; none before the first plan.
+        k: the tick.
+        mode: that ran before it; NONE for none.
+        entered: tick at which that was entered.
+    """
+    i = k - begin
+    if mode == JUMP:
+        over = i >= len(modes) or k - entered >= cfg.jump
+        # a plan that is too old may end the jump, but only in the stance that jumps end in
+        wanted = HAND if over else modes[i]
+        return wanted if i < cfg.expires or wanted == JUMP else HAND
+    return modes[i] if i < min(cfg.expires, len(modes)) else FOOT if mode == NONE else mode

@@ -30,7 +30,7 @@ from deploy.settings import EnvelopeCfg
 from deploy.so3 import Array
 from hmc.go2 import facts
 
-EMERGENCY = Button.L2 | Button.B
+NOTHING, EMERGENCY = Button(0), Button.L2 | Button.B
 PEAK_TORQUE = facts.PEAK * np.array(facts.GEAR)
 
 
@@ -57,7 +57,7 @@ class Inputs:
         planner: whether the planner has been heard of.
     """
 
-    buttons: Button = Button(0)
+    buttons: Button = NOTHING
     fault: str = ""
     posed: bool = False
     settled: bool = False

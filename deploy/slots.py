@@ -1,9 +1,9 @@
 """Latest-value slots between processes: one writer, any readers, no locks, nothing left behind.
 
-The memory is an anonymous file that children inherit by its descriptor: it has no name, so the kernel frees it
-with the last process that holds it, however that ended. A slot has two buffers that are written in turn, and a
-number that says which one is the newer. A reader copies it and believes what the checksum confirms; a writer
-that is killed half way leaves the value before.
+The memory is an anonymous file that children inherit by its descriptor: it has no name, so the kernel frees
+it with the last process that holds it, however that ended. A slot has two buffers that are written in turn,
+and a number that says which one is the newer. A reader copies it and believes what the checksum confirms; a
+writer that is killed half way leaves the value before.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ TEXT = 160  # octets of a reason
 
 # Times are those of the monotonic clock, which all processes of a machine share [s]; ticks are control steps
 # since the control process started.
-HEART = np.dtype([("t", "f8"), ("commanding", "u1"), ("latched", "u1"), ("reason", f"S{TEXT}")])
+HEART = np.dtype(
+    [("t", "f8"), ("pid", "i8"), ("commanding", "u1"), ("latched", "u1"), ("reason", f"S{TEXT}")]
+)
 STATE = np.dtype(
     [
         ("t", "f8"),
@@ -27,9 +29,9 @@ STATE = np.dtype(
         ("x", "f8", 37),  # estimate, as deploy.estimate.Estimate.x
         ("u", "f8", 12),  # joint targets commanded before it [rad]
         ("mode", "i4"),  # index of the mode that ran before it; -1: none yet
-        ("anchor", "f8", 4),  # where that mode was entered, see deploy.observe
+        ("entered", "i8"),  # tick at which it was entered
+        ("anchor", "f8", 4),  # and where, see deploy.observe
         ("plan", "i8"),  # number of the plan that runs; 0: none
-        ("begin", "i8"),  # tick of its first step
         ("asked", "i8"),  # tick from which the handstand is wanted; -1: not asked for
         ("running", "u1"),  # whether modes run at all
     ]
