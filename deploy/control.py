@@ -44,7 +44,7 @@ class Control:
         state: last good one.
         estimate: at it; None while the estimator does not know.
         target: joint targets commanded last [rad], (12,).
-        asked: tick from which the handstand is wanted; -1 while it is not.
+        asked: tick at which the operator asked for the handstand; -1 before.
         planner: whether the planner has been heard of.
         wait: what has to come before the robot may be started; "" for nothing.
         situation: value of the state's slot, of the last tick with modes.
@@ -123,7 +123,7 @@ class Control:
         before = self.machine.phase
         phase = self.machine.step(inputs)
         if self.machine.asked and self.asked < 0:
-            self.asked = self.k + self.cfg.plan.lead
+            self.asked = self.k
         if phase != before:
             self._enter(phase, before)
 

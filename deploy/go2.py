@@ -53,7 +53,8 @@ class Args:
         foot: policy file of the foot stand; default: the one that comes with the package.
         hand: policy file of the handstand, likewise.
         set: overrides of cfg/deploy.toml, such as plan.lead=100.
-        task_set: overrides of cfg/flip.toml, such as search.draws=8.
+        task_set: overrides of the task in cfg/flip.toml, such as substeps=2.
+        search: overrides of cfg/planner.toml, such as search.draws=16.
         threads: of the planner's engine; 0 for all cores.
     """
 
@@ -68,6 +69,7 @@ class Args:
     hand: str = ""
     set: tuple[str, ...] = ()
     task_set: tuple[str, ...] = ()
+    search: tuple[str, ...] = ()
     threads: int = 0
 
     @property
@@ -89,6 +91,7 @@ class Args:
             foot=self.foot,
             hand=self.hand,
             task_set=self.task_set,
+            search=self.search,
             seed=self.seed,
             threads=self.threads,
         )

@@ -6,21 +6,20 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from deploy.modes import HAND, JUMP, NAMES, NONE, due
-from deploy.process import Job, told, until_told
+from deploy.modes import FOOT, HAND, JUMP, NAMES, NONE, due
+from deploy.process import ROOT, Job, told, until_told
 from deploy.settings import DeployCfg, PlanCfg
 from deploy.slots import PLAN, STEPS, Board
-from hmc import Budget, Evaluator, Task, Trace, make_start, plan
+from hmc import Evaluator, Schedule, Task, Trace, make_start, plan
 from hmc.cfg import load
 from hmc.go2.model import DT
-from hmc.go2.stances import FOOTSTAND
+from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import FlipCfg, flip_task
 from hmc.receding import SearchCfg
 from hmc.start import Start
@@ -31,16 +30,17 @@ _KEPT = 40  # plans that the control process may still be running
 
 @dataclass(frozen=True)
 class PlannerCfg:
-    """What cfg/flip.toml says of the task and the search.
+    """cfg/planner.toml.
 
     Attributes:
-        seconds: of a run in simulation; not used here.
-        task: modes, cost, horizon.
-        search: effort of each plan.
+        lead: control steps from a plan's begin until the handstand is wanted, while the first way to it is
+            looked for.
+        first: effort of a plan then: the robot stands and can wait.
+        search: effort of every other plan.
     """
 
-    seconds: float = 0.0
-    task: FlipCfg = field(default_factory=FlipCfg)
+    lead: int = 45
+    first: SearchCfg = field(default_factory=SearchCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
 
 
@@ -60,49 +60,52 @@ class Shipped:
 class Planner:
     """Plans from the state that the running plan will have led to when the new one is ready.
 
-    The wish for the handstand is a moment in the task's time: until it is known, the task stands still before
-    it, and the whole horizon wants the foot stand.
+    Until the operator asks for the handstand, the whole horizon wants the foot stand. From then on, the moment
+    at which the handstand is wanted moves along ahead of the robot, until a schedule is found that ends in
+    it; then it stays where it is, and the plan is sent. A plan that leaves the foot stand for anything but a
+    handstand is not sent: the robot goes on standing, and the search begins anew.
 
     Attributes:
         task: what is planned.
         seconds: that the last plans took [s].
 
     Args:
-        cfg: task and search.
+        task: settings of the task.
+        cfg: effort.
         rules: of taking plans over.
         seed: of the draws and of the jump's noise.
         threads: of the engine; 0 for all cores.
     """
 
-    def __init__(self, cfg: PlannerCfg, rules: PlanCfg, *, seed: int = 0, threads: int = 0):
-        horizon = cfg.task.horizon
-        if horizon > STEPS:
-            raise ValueError(f"horizon must be at most {STEPS} control steps, got {horizon}")
-        self.task: Task = flip_task(replace(cfg.task, command=horizon), seed=seed, threads=threads)
+    def __init__(self, task: FlipCfg, cfg: PlannerCfg, rules: PlanCfg, *, seed: int = 0, threads: int = 0):
+        self._horizon = task.horizon
+        if not cfg.lead < self._horizon <= STEPS:
+            raise ValueError(
+                f"horizon must be more than the lead of {cfg.lead} control steps and at most {STEPS}, "
+                f"got {self._horizon}"
+            )
+        # in the task's own time, later than the end of a horizon that begins at 0
+        self._wanted = self._horizon + 1
+        self.task: Task = flip_task(replace(task, command=self._wanted), seed=seed, threads=threads)
         if self.task.modes.names != NAMES:
             raise ValueError(f"modes must be {', '.join(NAMES)}, got {', '.join(self.task.modes.names)}")
-        search = cfg.search
         self.seconds: deque[float] = deque([0.1] * 5, maxlen=30)
-        self._rules, self._seed = rules, seed
-        self._options = {
-            "samples": search.samples,
-            "order": search.order,
-            "pairs": search.pairs,
-            "moves": search.moves,
-            "budget": Budget(draws=search.draws, control_steps=search.control_steps),
-        }
-        self._sim = self.task.make_sim(1 + max(search.samples, search.pairs + search.moves))
+        self._cfg, self._rules, self._seed = cfg, rules, seed
+        searches = (cfg.first, cfg.search)
+        self._sim = self.task.make_sim(1 + max(max(it.samples, it.pairs + it.moves) for it in searches))
         self._one = self.task.make_sim(1)
         self._shipped: dict[int, Shipped] = {}
         self._number = 0
+        self._command: int | None = None  # tick from which the handstand is wanted
+        self._guess = [FOOT] * self._horizon  # incumbent while that is not known
+        self._known = False  # whether the guess ended in the handstand
 
     def warm(self) -> None:
         """Plan once for nothing: what is made on first use is made then."""
-        hand = self.task.horizon
-        start = make_start(self.task, self._sim, _upright(), _upright()[7:19], k=hand)
-        plan(
-            self.task, start, schedule=["foot"] * 10 + ["jump"] * 35 + ["hand"] * (hand - 45), **self._options
-        )
+        x = FOOTSTAND.state()
+        start = make_start(self.task, self._sim, x, x[7:19], k=self._wanted)
+        flip = [FOOT] * 10 + [JUMP] * 35 + [HAND] * (self._horizon - 45)
+        plan(self.task, start, schedule=flip, sim=self._sim, **self._cfg.search.options())
 
     @property
     def ahead(self) -> int:
@@ -118,32 +121,64 @@ class Planner:
             state: value of the state's slot.
             ahead: ticks.
         """
-        k, asked = int(state["k"]), int(state["asked"])
-        begin = k + ahead
+        begin = int(state["k"]) + ahead
         start, modes = self._predict(state, ahead)
-        now = begin - asked + self.task.horizon if asked >= 0 else 0
         if not bool(start.x.isfinite().all()):
             return None
+        searching = int(state["asked"]) >= 0 and start.mode == FOOT and self._command is None
+        if int(state["asked"]) < 0:
+            return self._ship(state, begin, start, self._follow(start, [FOOT] * self._horizon))
+        if searching:
+            start = replace(start, k=self._wanted - self._cfg.lead)
+            effort, modes = self._cfg.search if self._known else self._cfg.first, self._guess
+        else:
+            command = begin if self._command is None else self._command
+            start = replace(start, k=max(0, begin - command + self._wanted))
+            effort = self._cfg.search
         found = plan(
             self.task,
-            replace(start, k=max(0, now)),
+            start,
             schedule=modes,
             seed=(self._seed, begin),
             sim=self._sim,
             forget=False,
-            **self._options,
+            **effort.options(),
         )
         trace = found.known
         if trace.schedule != found.schedule:
-            trace = Evaluator(self.task, self._sim, replace(start, k=max(0, now)), trace).trace(
-                found.schedule
-            )
-        if len(trace) < len(found.schedule):
+            trace = self._follow(start, found.schedule.modes, trace)
+        reached = len(trace) == self._horizon and bool(HANDSTAND.held(trace.x[-1:]))
+        if start.mode != FOOT:
+            return self._ship(state, begin, start, trace)
+        if searching:
+            known, self._known, self._guess = self._known, reached, list(found.schedule)
+            if not (known and reached):
+                return None
+            self._command = begin + self._cfg.lead
+        elif not reached:
+            self._command, self._known, self._guess = None, False, list(found.schedule)
+            trace = self._follow(start, [FOOT] * self._horizon)
+        return self._ship(state, begin, start, trace)
+
+    def _follow(self, start: Start, modes: Sequence[int], known: Trace | None = None) -> Trace:
+        """What a schedule leads to."""
+        evaluator = Evaluator(self.task, self._sim, start, known)
+        return evaluator.trace(Schedule(tuple(modes), NAMES))
+
+    def _ship(self, state: np.ndarray, begin: int, start: Start, trace: Trace) -> np.ndarray | None:
+        """The value of the plan's slot for a schedule and what it leads to."""
+        if len(trace) < self._horizon:
             return None
         self._number += 1
         self._shipped[self._number] = Shipped(begin, trace)
         self._shipped.pop(self._number - _KEPT, None)
-        return self._record(self._number, state, begin, start.mode, trace, found.cost)
+        record = np.zeros((), PLAN)
+        record["number"], record["base"], record["begin"] = self._number, state["k"], begin
+        record["running"] = NONE if start.mode is None else start.mode
+        record["steps"], record["cost"] = len(trace), trace.cost
+        record["modes"][: len(trace)] = trace.modes
+        record["u"][: len(trace)] = trace.u[1:].numpy()
+        return record
 
     def _predict(self, state: np.ndarray, ahead: int) -> tuple[Start, list[int]]:
         """The situation `ahead` ticks later under the running plan, and its modes from there on."""
@@ -172,17 +207,6 @@ class Planner:
             schedule = [HAND] * len(at)
         return Start(x[0], u[0], mode, memory[0, : self.task.modes[mode].memory_size].to(x), 0), schedule
 
-    def _record(
-        self, number: int, state: np.ndarray, begin: int, running: int | None, trace: Trace, cost: float
-    ) -> np.ndarray:
-        record, steps = np.zeros((), PLAN), len(trace.modes)
-        record["number"], record["base"], record["begin"] = number, state["k"], begin
-        record["running"] = NONE if running is None else running
-        record["steps"], record["cost"] = steps, cost
-        record["modes"][:steps] = trace.modes
-        record["u"][:steps] = trace.u[1:].numpy()
-        return record
-
 
 def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
     """Plan for every new state until `stopped()`."""
@@ -206,17 +230,17 @@ def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
             board.plan.write(record)
 
 
-def _upright() -> Tensor:
-    return FOOTSTAND.state()
-
-
 def main(job: Job) -> None:
     """Be the planner until SIGTERM."""
     stopped = until_told()
     os.nice(NICE)
     torch.set_num_threads(1)
-    cfg, rules = load(job.task, PlannerCfg, job.task_set), load(job.cfg, DeployCfg, job.set).plan
-    run(Board(job.board), Planner(cfg, rules, seed=job.seed, threads=job.threads), stopped)
+    task = load(job.task, FlipCfg, job.task_set, table="task")
+    cfg, rules = (
+        load(ROOT / "cfg" / "planner.toml", PlannerCfg, job.search),
+        load(job.cfg, DeployCfg, job.set).plan,
+    )
+    run(Board(job.board), Planner(task, cfg, rules, seed=job.seed, threads=job.threads), stopped)
 
 
 if __name__ == "__main__":

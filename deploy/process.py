@@ -37,7 +37,8 @@ class Job:
         release: let the robot's own controller be stopped.
         foot, hand: policy files; empty for those that come with the package.
         task: the planner's settings file.
-        task_set: overrides of it.
+        task_set: overrides of its table `task`.
+        search: overrides of cfg/planner.toml.
         seed: of the planner.
         threads: of the planner's engine; 0 for all cores.
     """
@@ -56,6 +57,7 @@ class Job:
     hand: str = ""
     task: str = str(ROOT / "cfg" / "flip.toml")
     task_set: tuple[str, ...] = ()
+    search: tuple[str, ...] = ()
     seed: int = 0
     threads: int = 0
 

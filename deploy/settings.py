@@ -108,14 +108,12 @@ class PlanCfg:
     Attributes:
         expires: control steps after a plan's begin from which on it starts no other mode.
         jump: control steps that a jump may last.
-        lead: control steps from the operator's wish for the handstand until the cost asks for it.
         quantile: of the planner's latest times that the next one is expected to take.
         longest: control steps that are planned ahead for, at most.
     """
 
     expires: int = 40
     jump: int = 60
-    lead: int = 75
     quantile: float = 0.8
     longest: int = 40
 

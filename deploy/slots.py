@@ -32,7 +32,7 @@ STATE = np.dtype(
         ("entered", "i8"),  # tick at which it was entered
         ("anchor", "f8", 4),  # and where, see deploy.observe
         ("plan", "i8"),  # number of the plan that runs; 0: none
-        ("asked", "i8"),  # tick from which the handstand is wanted; -1: not asked for
+        ("asked", "i8"),  # tick at which the handstand was asked for; -1: not yet
         ("running", "u1"),  # whether modes run at all
     ]
 )
