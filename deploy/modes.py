@@ -99,6 +99,8 @@ class Performer:
             u: targets commanded last [rad], (12,).
         """
         mode = self._choose(k)
+        if self.mode == JUMP and mode == HAND and not self._planned(k, HAND):
+            self.plan = None  # the jump was cut short: what the plan says after it is void
         if mode != self.mode:
             self.mode, self.entered, self.anchor = mode, k, anchor_of(x)
         self._ran[k] = mode
@@ -122,6 +124,11 @@ class Performer:
         else:
             self.counts["taken"] += 1
             self.plan = plan
+
+    def _planned(self, k: int, mode: int) -> bool:
+        """Whether the plan names this mode for a tick."""
+        plan = self.plan
+        return plan is not None and k - plan.begin < len(plan.modes) and plan.modes[k - plan.begin] == mode
 
     def _choose(self, k: int) -> int:
         """The mode of tick k."""

@@ -60,10 +60,10 @@ class Shipped:
 class Planner:
     """Plans from the state that the running plan will have led to when the new one is ready.
 
-    Until the operator asks for the handstand, the whole horizon wants the foot stand. From then on, the moment
-    at which the handstand is wanted moves along ahead of the robot, until a schedule is found that ends in
-    it; then it stays where it is, and the plan is sent. A plan that leaves the foot stand for anything but a
-    handstand is not sent: the robot goes on standing, and the search begins anew.
+    Until the operator asks for the handstand, the whole horizon wants the foot stand. From then on,
+    the moment at which the handstand is wanted moves along ahead of the robot, until a schedule is
+    found that ends in it; then it stays where it is, and the plan is sent. A plan that leaves the foot
+    stand for anything but a handstand is not sent: the robot stands, and the search begins anew.
 
     Attributes:
         task: what is planned.
@@ -198,13 +198,17 @@ class Planner:
                 chosen = self.task.modes[wanted]
                 memory = chosen.reset(x, u, step) if wanted != mode else memory[:, : chosen.memory_size]
                 u, memory = chosen.act(x, u, memory, step)
+            if (
+                mode == JUMP
+                and wanted == HAND
+                and (tick - begin >= len(modes) or modes[tick - begin] != HAND)
+            ):
+                running, modes = None, ()  # as `Performer` does
             mode, entered = wanted, tick if wanted != mode else entered
             self._one.step(u)
             x = self._one.x()
         at = range(k + ahead - begin, k + ahead - begin + self.task.horizon)
         schedule = [modes[min(max(i, 0), len(modes) - 1)] for i in at] if modes else [mode] * len(at)
-        if mode == JUMP and schedule[0] != JUMP:  # it was ended
-            schedule = [HAND] * len(at)
         return Start(x[0], u[0], mode, memory[0, : self.task.modes[mode].memory_size].to(x), 0), schedule
 
 
