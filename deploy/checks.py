@@ -40,23 +40,19 @@ class StateChecks:
         try:
             state = decode_state(frame)
         except FrameError:
-            return self._refuse("no LowState frame")
-        if not state.crc_ok:
-            return self._refuse("checksum")
-        if wrong := self._range(state):
-            return self._refuse(wrong)
-        if math.isfinite(self.heard):
-            ahead = (state.tick - self.ms + _WRAP // 2) % _WRAP - _WRAP // 2
-            if ahead == 0:
-                return self._refuse("repeated")
-            if ahead < -_RESTART:
-                self._fault = f"the robot's clock went back by {-ahead} ms: it restarted"
-            if ahead < 0:
-                return self._refuse("out of order")
+            self._refuse("no LowState frame")
+            return None
+        ahead = (state.tick - self.ms + _WRAP // 2) % _WRAP - _WRAP // 2
+        first = not math.isfinite(self.heard)
+        wrong = "" if state.crc_ok else "checksum"
+        if wrong := wrong or self._range(state) or ("" if first else self._order(ahead)):
+            self._refuse(wrong)
+            return None
+        if first:
+            self.ms = state.tick
+        else:
             self.counts["gap"] += ahead // 2 - 1
             self.ms += ahead
-        else:
-            self.ms = state.tick
         self.heard = now
         if (hottest := int(state.temperature.max())) > self.cfg.temperature:
             self._fault = f"a motor has {hottest} deg C, allowed are {self.cfg.temperature:g}: let it cool"
@@ -75,6 +71,12 @@ class StateChecks:
     def _refuse(self, reason: str) -> None:
         self.counts[reason] += 1
         self._last = reason
+
+    def _order(self, ahead: int) -> str:
+        """What is wrong with a frame so many ms after the last good one."""
+        if ahead < -_RESTART:
+            self._fault = f"the robot's clock went back by {-ahead} ms: it restarted"
+        return "repeated" if ahead == 0 else "out of order" if ahead < 0 else ""
 
     def _range(self, state: RobotState) -> str:
         """What of a frame cannot be; comparisons are written so that NaN fails them."""

@@ -85,7 +85,13 @@ class Control:
             return False
         self.state, ms = state, self.checks.ms
         self.estimate = self.estimator.update(
-            0.001 * ms, state.gyro, state.acc, state.q, state.dq, state.tau, state.foot_force
+            0.001 * ms,
+            state.gyro,
+            state.acc,
+            state.q,
+            state.dq,
+            state.tau,
+            state.foot_force.astype(np.float64),
         )
         fault = self._fault or self.checks.fault(now) or self._outside(state)
         if self.phase == Phase.PASSIVE:

@@ -142,6 +142,11 @@ def _end(process: subprocess.Popen[str], wait: float = 10.0) -> None:
         process.stdout.close()
 
 
+def _end_all(processes: list[subprocess.Popen[str]]) -> None:
+    for process in processes:
+        _end(process)
+
+
 def run(args: Args, console: Console, port: Port | None) -> None:
     """Start all processes, show the run until it is over, end them so that the robot stays damped."""
     board, (source, sink) = Board(), pipe()
@@ -153,11 +158,12 @@ def run(args: Args, console: Console, port: Port | None) -> None:
         stack.callback(log.wait)  # it ends when the control process has
         os.close(source)
         watch: list[subprocess.Popen[str]] = []
-        stack.callback(lambda: [_end(process) for process in watch])
+        stack.callback(_end_all, watch)
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE}
         control = spawn("loop", Job(**{**base, "log": sink}), [board.descriptor, sink], **pipes)
         os.close(sink)
-        stack.callback(lambda: (_end(control), time.sleep(DAMPED)))
+        stack.callback(time.sleep, DAMPED)
+        stack.callback(_end, control)
         console.print(f"control process: {_ready(control, 'the control process').strip()}", highlight=False)
         if not args.dry_run:
             watch.append(spawn("watchdog", Job(**{**base, "pid": control.pid}), [board.descriptor]))

@@ -26,7 +26,7 @@ from deploy.policy import Policy
 from deploy.process import ROOT, Job, real_time, told, until_told
 from deploy.safety import Phase
 from deploy.settings import DeployCfg, InputCfg
-from deploy.slots import Board, text
+from deploy.slots import Board, said, text
 from deploy.timing import Lateness
 from hmc.cfg import load
 
@@ -139,7 +139,7 @@ class Loop:
         guard = board.guard.read()
         if guard is not None and guard["latched"] and not self._silent:
             self._silent = True  # the watchdog damps the robot by now, and two must not command
-            control.fail(guard["reason"].decode())
+            control.fail(said(guard["reason"].item()))
         if not self._dry_run:
             control.wait = "the watchdog has not started yet" if guard is None else ""
             if guard is not None and now - float(guard["t"]) > control.cfg.watchdog.lost:

@@ -53,8 +53,8 @@ class Plan:
             raise ValueError(f"plan {record['number']} has {steps} steps of modes {sorted(set(modes))}")
         if not np.isfinite(u).all():
             raise ValueError(f"plan {record['number']} has targets that are not numbers")
-        numbers = (int(record[name]) for name in ("number", "base", "begin", "running"))
-        return cls(*numbers, modes, u)
+        number, base, begin, running = (int(record[name]) for name in ("number", "base", "begin", "running"))
+        return cls(number, base, begin, running, modes, u)
 
 
 class Performer:

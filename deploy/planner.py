@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from deploy.modes import FOOT, HAND, JUMP, NAMES, NONE, due
-from deploy.process import ROOT, Job, told, until_told
+from deploy.process import ROOT, Job, allowed, told, until_told
 from deploy.settings import DeployCfg, PlanCfg
 from deploy.slots import PLAN, STEPS, Board
 from hmc import Evaluator, Schedule, Task, Trace, make_start, plan
@@ -24,7 +24,7 @@ from hmc.go2.task import FlipCfg, flip_task
 from hmc.receding import SearchCfg
 from hmc.start import Start
 
-NICE = 5  # what controls the robot goes first
+NICE = 5  # where what controls the robot may not have a real-time priority
 _KEPT = 40  # plans that the control process may still be running
 
 
@@ -198,11 +198,7 @@ class Planner:
                 chosen = self.task.modes[wanted]
                 memory = chosen.reset(x, u, step) if wanted != mode else memory[:, : chosen.memory_size]
                 u, memory = chosen.act(x, u, memory, step)
-            if (
-                mode == JUMP
-                and wanted == HAND
-                and (tick - begin >= len(modes) or modes[tick - begin] != HAND)
-            ):
+            if mode == JUMP and wanted == HAND and modes[tick - begin : tick - begin + 1] != (HAND,):
                 running, modes = None, ()  # as `Performer` does
             mode, entered = wanted, tick if wanted != mode else entered
             self._one.step(u)
@@ -237,7 +233,8 @@ def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
 def main(job: Job) -> None:
     """Be the planner until SIGTERM."""
     stopped = until_told()
-    os.nice(NICE)
+    if not allowed():
+        os.nice(NICE)
     torch.set_num_threads(1)
     task = load(job.task, FlipCfg, job.task_set, table="task")
     cfg, rules = (

@@ -70,8 +70,11 @@ def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> 
 
 def told() -> Job:
     """The job that this process was started with."""
-    found = json.loads(sys.argv[1])
-    return Job(**{name: tuple(value) if isinstance(value, list) else value for name, value in found.items()})
+    found: dict[str, Any] = json.loads(sys.argv[1])
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in found.items()
+    }
+    return Job(**values)
 
 
 def until_told(parent_matters: bool = True) -> Callable[[], bool]:
@@ -99,5 +102,14 @@ def real_time(priority: int) -> bool:
     gc.freeze()
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        return True
+    return False
+
+
+def allowed() -> bool:
+    """Whether the kernel grants real-time priorities to this user."""
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         return True
     return False

@@ -169,6 +169,11 @@ class Board:
         os.close(self.descriptor)
 
 
+def said(reason: object) -> str:
+    """The reason in a slot's value."""
+    return reason.decode(errors="replace") if isinstance(reason, bytes) else ""
+
+
 def text(reason: str) -> bytes:
     """A reason as it goes into a slot."""
     return reason.encode()[:TEXT]

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from deploy.modes import NAMES
 from deploy.safety import Phase
+from deploy.slots import said
 from deploy.timing import EDGES
 
 _COLORS = {Phase.PASSIVE: "dim", Phase.HYBRID: "green", Phase.DAMPING: "red"}
@@ -20,7 +21,7 @@ def picture(status: np.ndarray) -> RenderableType:
     phase, mode = Phase(int(status["phase"])), int(status["mode"])
     table = Table(show_header=False, box=None)
     color = _COLORS.get(phase, "yellow")
-    table.add_row("phase", f"[{color}]{phase.name.lower()}[/] {status['reason'].decode()}")
+    table.add_row("phase", f"[{color}]{phase.name.lower()}[/] {said(status['reason'].item())}")
     table.add_row("mode", NAMES[mode] if mode >= 0 and phase == Phase.HYBRID else "-")
     table.add_row("body", f"pitch {status['pitch']:+.0f} deg, height {status['height']:.2f} m")
     table.add_row("battery", f"{status['charge']} %")
@@ -45,7 +46,7 @@ class View:
     def __init__(self, console: Console):
         self._console = console
         self._live = Live(console=console, transient=True) if console.is_terminal else None
-        self._last = (-1, -1, b"")
+        self._last = (-1, -1, "")
 
     def __enter__(self) -> View:
         if self._live is not None:
@@ -61,10 +62,10 @@ class View:
         if self._live is not None:
             self._live.update(picture(status))
             return
-        now = (int(status["phase"]), int(status["mode"]), bytes(status["reason"]))
+        now = (int(status["phase"]), int(status["mode"]), said(status["reason"].item()))
         if now != self._last:
             self._last = now
             mode = NAMES[now[1]] if now[1] >= 0 and now[0] == Phase.HYBRID else ""
-            words = (Phase(now[0]).name.lower(), mode, now[2].decode())
+            words = (Phase(now[0]).name.lower(), mode, now[2])
             seconds = 0.02 * int(status["k"])
             self._console.print(f"{seconds:6.2f} s  {' '.join(filter(None, words))}", highlight=False)
