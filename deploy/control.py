@@ -82,6 +82,7 @@ class Control:
         """Take a state frame that came `now` [s]; whether it made a tick."""
         state = self.checks.take(frame, now)
         if state is None:
+            self.idle(now)
             return False
         self.state, ms = state, self.checks.ms
         self.estimate = self.estimator.update(
@@ -107,7 +108,7 @@ class Control:
         return True
 
     def idle(self, now: float) -> None:
-        """No frame has come for a while."""
+        """No frame came that is believed."""
         self._step(Inputs(fault=self._fault or self.checks.fault(now)))
 
     def fail(self, fault: str) -> None:

@@ -100,7 +100,7 @@ class Machine:
             return self.phase
         if self.phase == Phase.STAND and inputs.posed and inputs.settled:
             self.phase = Phase.READY
-        if pressed & Button.START:
+        elif pressed & Button.START:
             self._start(inputs)
         return self.phase
 
