@@ -22,10 +22,10 @@ from rich.console import Console  # noqa: E402
 from deploy.buttons import Operator, Port  # noqa: E402
 from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
 from deploy.log import pipe  # noqa: E402
+from deploy.loop import policies  # noqa: E402
 from deploy.process import Job, spawn  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
-from deploy.summary import summarise, write  # noqa: E402
 from deploy.view import View  # noqa: E402
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
@@ -190,6 +190,7 @@ def main(args: Args) -> int:
     console = Console()
     with one_line_errors():
         load(args.job().cfg, DeployCfg, args.set)
+        policies(args.foot, args.hand)
         args.out.mkdir(parents=True, exist_ok=True)
         for name in ("run.mcap", "truth.npz", "summary.json"):
             (args.out / name).unlink(missing_ok=True)
@@ -204,6 +205,8 @@ def main(args: Args) -> int:
     except Ended as ended:
         # what was wrong, the process has said itself
         return 2 if ended.status in (1, 2) else 1
+    from deploy.summary import summarise, write  # loads torch: seconds that the start need not wait for
+
     with one_line_errors():
         summary = summarise(args.out / "run.mcap", truth)
     write(args.out / "summary.json", summary)
