@@ -23,7 +23,7 @@ from deploy.buttons import Operator, Port  # noqa: E402
 from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
 from deploy.log import pipe  # noqa: E402
 from deploy.loop import policies  # noqa: E402
-from deploy.process import Job, spawn  # noqa: E402
+from deploy.process import ENVIRONMENT, Job, spawn  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
 from deploy.view import View  # noqa: E402
@@ -111,7 +111,9 @@ def stand_in(args: Args, domain: int) -> Iterator[Port]:
     command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--robot.start", "lying"]
     command += ["--robot.seed", str(args.seed), "--log", str(args.out / "truth.npz"), *args.robot.split()]
     # a session of its own: Ctrl-C is ours to pass on, when the robot has been damped
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
     try:
         port = re.search(r"orders at UDP port (\d+)", _ready(process, "the stand-in"))
         assert port

@@ -13,11 +13,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 _PR_SET_PDEATHSIG = 1
-T = TypeVar("T")
+# matrices of 27 rows only lose by threads, which wait for each other in loops that fill a core
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Job:
 def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:
     """Start a module of `deploy` as a process that inherits these descriptors."""
     command = [sys.executable, "-m", f"deploy.{module}", json.dumps(asdict(job))]
-    return subprocess.Popen(command, cwd=ROOT, pass_fds=descriptors, text=True, **streams)
+    return subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, pass_fds=descriptors, text=True, **streams)
 
 
 def told() -> Job:
