@@ -56,6 +56,7 @@ class Args:
         task_set: overrides of the task in cfg/flip.toml, such as substeps=2.
         search: overrides of cfg/planner.toml, such as search.draws=16.
         threads: of the planner's engine; 0 for all cores.
+        speed: of the stand-in's clock, for slow motion where the machine is busy; 1 on a robot.
     """
 
     interface: str = LOOPBACK
@@ -71,6 +72,7 @@ class Args:
     task_set: tuple[str, ...] = ()
     search: tuple[str, ...] = ()
     threads: int = 0
+    speed: float = 1.0
 
     @property
     def simulated(self) -> bool:
@@ -94,6 +96,7 @@ class Args:
             search=self.search,
             seed=self.seed,
             threads=self.threads,
+            speed=self.speed,
         )
 
 
@@ -109,7 +112,8 @@ class Ended(RuntimeError):
 def stand_in(args: Args, domain: int) -> Iterator[Port]:
     """The stand-in as a process, lying; its truth goes to truth.npz when it ends."""
     command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--robot.start", "lying"]
-    command += ["--robot.seed", str(args.seed), "--log", str(args.out / "truth.npz"), *args.robot.split()]
+    command += ["--robot.seed", str(args.seed), "--log", str(args.out / "truth.npz")]
+    command += ["--speed", str(args.speed), *args.robot.split()]
     # a session of its own: Ctrl-C is ours to pass on, when the robot has been damped
     process = subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -193,6 +197,10 @@ def main(args: Args) -> int:
     with one_line_errors():
         load(args.job().cfg, DeployCfg, args.set)
         policies(args.foot, args.hand)
+        if not 0 < args.speed <= 1 or (args.speed != 1 and not args.simulated):
+            raise ValueError(
+                f"speed is above 0 and at most 1 on the stand-in, 1 on a robot; got {args.speed:g}"
+            )
         args.out.mkdir(parents=True, exist_ok=True)
         for name in ("run.mcap", "truth.npz", "summary.json"):
             (args.out / name).unlink(missing_ok=True)

@@ -10,6 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,7 @@ class Loop:
         control: what decides.
         recorder: of the log.
         dry_run: command nothing.
+        speed: of the robot's clock.
     """
 
     def __init__(
@@ -92,9 +94,11 @@ class Loop:
         control: Control,
         recorder: Recorder,
         dry_run: bool,
+        speed: float = 1.0,
     ):
         self._link, self._states, self._board = link, states, board
         self._control, self._recorder, self._dry_run = control, recorder, dry_run
+        self._speed = speed
         self._commands = None if dry_run else link.publisher("rt/lowcmd", LowCmd_)
         self._lateness = Lateness()
         self._phase, self._hint, self._logged = Phase.PASSIVE, "", b""
@@ -179,7 +183,7 @@ class Loop:
     def _tell(self, now: float, left: float) -> None:
         """Tell planner, view and log of a tick."""
         control, performer = self._control, self._control.performer
-        late = self._lateness.add(0.001 * control.due_ms, left)
+        late = self._lateness.add(0.001 * control.due_ms / self._speed, left)
         if control.phase == Phase.HYBRID:
             control.situation["t"] = now
             self._board.state.write(control.situation)
@@ -245,12 +249,13 @@ def policies(foot: str, hand: str) -> dict[int, Policy]:
 def run(job: Job, stopped: Callable[[], bool]) -> None:
     """Control the robot until `stopped()`."""
     cfg = load(job.cfg, DeployCfg, job.set)
+    cfg = replace(cfg, input=replace(cfg.input, max_age=cfg.input.max_age / job.speed))
     control = Control(cfg, policies(job.foot, job.hand))
     quick = real_time(PRIORITY)
     link = Link(job.domain, job.interface)
     states = link.subscriber("rt/lowstate", LowState_)
     preflight(link, states, cfg.input, job.release)
-    loop = Loop(link, states, Board(job.board), control, Recorder(job.log), job.dry_run)
+    loop = Loop(link, states, Board(job.board), control, Recorder(job.log), job.dry_run, job.speed)
     print(f"ready: {'real-time' if quick else 'normal'} priority", flush=True)
     states.take()  # those that came meanwhile are old
     while not stopped():

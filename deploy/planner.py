@@ -75,10 +75,20 @@ class Planner:
         rules: of taking plans over.
         seed: of the draws and of the jump's noise.
         threads: of the engine; 0 for all cores.
+        speed: of the robot's clock.
     """
 
-    def __init__(self, task: FlipCfg, cfg: PlannerCfg, rules: PlanCfg, *, seed: int = 0, threads: int = 0):
-        self._horizon = task.horizon
+    def __init__(
+        self,
+        task: FlipCfg,
+        cfg: PlannerCfg,
+        rules: PlanCfg,
+        *,
+        seed: int = 0,
+        threads: int = 0,
+        speed: float = 1.0,
+    ):
+        self._horizon, self._tick = task.horizon, DT / speed
         if not cfg.lead < self._horizon <= STEPS:
             raise ValueError(
                 f"horizon must be more than the lead of {cfg.lead} control steps and at most {STEPS}, "
@@ -111,7 +121,7 @@ class Planner:
     def ahead(self) -> int:
         """Ticks that planning is expected to take."""
         expected = float(np.quantile(self.seconds, self._rules.quantile))
-        return min(1 + math.ceil(expected / DT), self._rules.longest)
+        return min(1 + math.ceil(expected / self._tick), self._rules.longest)
 
     @torch.no_grad()
     def plan(self, state: np.ndarray, ahead: int) -> np.ndarray | None:
@@ -241,7 +251,11 @@ def main(job: Job) -> None:
         load(ROOT / "cfg" / "planner.toml", PlannerCfg, job.search),
         load(job.cfg, DeployCfg, job.set).plan,
     )
-    run(Board(job.board), Planner(task, cfg, rules, seed=job.seed, threads=job.threads), stopped)
+    run(
+        Board(job.board),
+        Planner(task, cfg, rules, seed=job.seed, threads=job.threads, speed=job.speed),
+        stopped,
+    )
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ class Job:
         search: overrides of cfg/planner.toml.
         seed: of the planner.
         threads: of the planner's engine; 0 for all cores.
+        speed: of the robot's clock; not 1 in slow motion alone.
     """
 
     board: int = -1
@@ -61,6 +62,7 @@ class Job:
     search: tuple[str, ...] = ()
     seed: int = 0
     threads: int = 0
+    speed: float = 1.0
 
 
 def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:

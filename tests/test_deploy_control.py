@@ -89,6 +89,7 @@ def test_from_lying_to_the_foot_stand_with_the_estimate_alone(seed):
     assert rig.control.missed == 0
     assert rig.control.k == 249  # every 20 ms of the robot's time
     estimate, truth = rig.control.estimate, rig.robot.truth()
+    assert estimate is not None
     assert estimate.x[2] == pytest.approx(truth.qpos[2], abs=0.03)
     assert np.linalg.norm(estimate.velocity - truth.qvel[:3]) < 0.1
 
@@ -129,7 +130,7 @@ def met() -> Met:
         for _ in range(100):
             frames += rig.robot.step(rig.sent)
             rig.control.hear(frames[-1], rig.robot.time)
-            rig.sent = [rig.control.command]
+            rig.sent = [rig.control.command or b""]
         found[phase] = kept, frames
     return found
 

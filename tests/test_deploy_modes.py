@@ -84,11 +84,12 @@ def test_a_policy_of_another_interface_is_refused(tmp_path):
         Policy(tmp_path / "none.onnx")
 
 
-class Counting:
+class Counting(Policy):
     """A policy that returns how it was called."""
 
-    def __init__(self, value: float):
-        self.value, self.anchors = value, []
+    def __init__(self, value: float):  # no file
+        self.value = value
+        self.anchors: list[np.ndarray] = []
 
     def act(self, x, u, anchor):
         self.anchors.append(anchor)
@@ -131,9 +132,12 @@ def test_a_plan_runs_from_its_begin_on_and_its_jump_as_planned():
     modes, targets = play(it, 3, 13)
     assert modes == "ff" + "ffjjhhhh"
     assert targets[4:6] == [102.0, 103.0]
+    assert it.plan is not None
     assert it.plan.number == 1
     assert it.anchor[0] == 9  # where the handstand's mode was entered
-    assert {anchor[0] for anchor in it._policies[FOOT].anchors} == {0}  # kept while the mode runs on
+    foot = it._policies[FOOT]
+    assert isinstance(foot, Counting)
+    assert {anchor[0] for anchor in foot.anchors} == {0}  # kept while the mode runs on
 
 
 def test_a_late_plan_counts_only_if_it_says_what_ran():

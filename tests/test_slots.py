@@ -92,7 +92,7 @@ def test_a_value_of_another_layout_is_refused(board):
 def test_readers_of_a_busy_writer_that_is_killed(board):
     command = [sys.executable, "-c", WRITER, str(board.descriptor)]
     with subprocess.Popen(command, cwd=ROOT, pass_fds=[board.descriptor]) as writer:
-        seen = []
+        seen: list[int] = []
         until = time.monotonic() + 10
         while len(seen) < 500 and time.monotonic() < until:
             read = board.state.read()
