@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -236,6 +236,8 @@ def test_killed_in_the_foot_stand(program):
     time.sleep(1.0)
     control = program.child("deploy.loop")
     program.commands.take()
+    with suppress(PermissionError):  # or the test's own wait for a core is measured
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(30))
     os.kill(control, signal.SIGKILL)
     killed = time.monotonic()
     damped = None
@@ -243,6 +245,7 @@ def test_killed_in_the_foot_stand(program):
         for frame in program.commands.take(0.005):
             if not decode_command(frame).motors.kp.any():
                 damped = time.monotonic()
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     assert damped is not None
     assert damped - killed < 0.02
     program.end()
