@@ -1,4 +1,4 @@
-# make demo | test | lint | format | ci | clean. Each does all the set-up it needs, once.
+# make demo | test | test-deploy | lint | format | ci | clean. Each does all the set-up it needs, once.
 
 # The first interpreter of a tested version; `make PYTHON=/path/to/python3.x ...` takes another.
 CANDIDATES := python3 python3.13 python3.12 python3.11 python
@@ -15,11 +15,11 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 EXTRAS := warp,train,demo,deploy,sdk,dev
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format ci clean
+.PHONY: help setup demo test test-deploy lint format ci clean
 .DELETE_ON_ERROR:
 
 help: ## List the commands
-	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "make %-8s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-11s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
 
 setup: $(READY) ## Virtual environment with the tested set of packages
 
@@ -28,6 +28,9 @@ demo: $(READY) ## The Go2 plans its way from hind legs to a handstand, three see
 
 test: $(READY) ## All tests
 	$(BIN)/python -m pytest
+
+test-deploy: $(READY) ## The longer tests of the robot's processes, some minutes
+	$(BIN)/python -m pytest -m deploy
 
 lint: $(READY) ## Style, format and types; changes nothing
 	$(BIN)/ruff check .

@@ -7,6 +7,7 @@ objects costs a Python process about 0.3 ms a message, and `deploy.codec` reads 
 from __future__ import annotations
 
 import socket
+from collections.abc import Collection
 from functools import cache
 from typing import Any
 
@@ -179,20 +180,25 @@ class Link:
         """
         return Subscriber(self._participant, self._topic(topic, message), depth, reliable)
 
-    def rivals(self, topic: str) -> list[str]:
+    def rivals(self, topic: str, ours: Collection[int] = ()) -> list[str]:
         """Who else publishes a topic: a name, host and process for each publisher outside this link.
 
         Two controllers on rt/lowcmd would both move the motors: ask before commanding, and while doing so.
         To be found takes a new process about 0.2 s; one that was killed is listed for 3 s more, 10 s with
         other programs' settings.
+
+        Args:
+            topic: its name.
+            ours: numbers of processes on this machine that may.
         """
         own = self._participant.guid
-        found = self._publications.read(_MANY, self._alive)
-        keys = [it.participant_key for it in found if it.topic_name == topic and it.participant_key != own]
+        writers = self._publications.read(_MANY, self._alive)
+        keys = [it.participant_key for it in writers if it.topic_name == topic and it.participant_key != own]
         if not keys:
             return []
-        names = {it.key: _name(it.qos) for it in self._participants.read(_MANY, self._present)}
-        return [names.get(key, f"participant {key}") for key in keys]
+        found = {it.key: it.qos for it in self._participants.read(_MANY, self._present)}
+        names = {key: _name(qos) for key, qos in found.items() if _process(qos) not in ours}
+        return [names.get(key, f"participant {key}") for key in keys if key in names or key not in found]
 
     def _topic(self, name: str, message: type[IdlStruct]) -> Topic[Any]:
         topic: Topic[Any] = Topic(self._participant, name, message, Qos(_REPRESENTATION))
@@ -207,8 +213,20 @@ def _configure(domain: int, interface: str) -> Domain:
     return Domain(domain, _CONFIG.format(interface=interface, multicast=multicast, discovery=discovery))
 
 
+def _told(qos: Qos) -> dict[str, str]:
+    """What a participant says of itself."""
+    return {policy.key: policy.value for policy in qos if isinstance(policy, Policy.Property)}
+
+
+def _process(qos: Qos) -> int:
+    """Number of a participant's process on this machine; -1 on another one, or if it does not say."""
+    told = _told(qos)
+    here = told.get("__Hostname") == socket.gethostname()
+    return int(told["__Pid"]) if here and told.get("__Pid", "").isdecimal() else -1
+
+
 def _name(qos: Qos) -> str:
     """Process, number and host of a participant, as far as it says."""
-    told = {policy.key: policy.value for policy in qos if isinstance(policy, Policy.Property)}
+    told = _told(qos)
     process, number = told.get("__ProcessName", "a process"), told.get("__Pid", "?")
     return f"{process} (process {number} on {told.get('__Hostname', 'an unnamed host')})"

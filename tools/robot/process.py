@@ -35,6 +35,7 @@ class Args:
         order: orders at the start, JSON objects.
         log: file for the truth, .npz; none is written without.
         seconds: of simulated time, then it ends.
+        speed: of its clock: 0.5 takes 2 s for one of its own, where the machine is too slow for more.
         lockstep: wait for a command after every state instead of keeping time: for tests that repeat.
     """
 
@@ -45,6 +46,7 @@ class Args:
     order: tuple[str, ...] = ()
     log: Path | None = None
     seconds: float = float("inf")
+    speed: float = 1.0
     lockstep: bool = False
 
 
@@ -93,7 +95,7 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
     outgoing = robot.step([])
     where = f"domain {args.domain} on {args.interface}, orders at UDP port {desk.port}"
     say(f"ready: {where}, {priority()}")
-    clock = Clock()
+    clock = Clock(PERIOD / args.speed)
     while robot.time < args.seconds and not stopped():
         for frame in outgoing:
             states.write(frame)
@@ -143,15 +145,16 @@ def priority() -> str:
 
 
 class Clock:
-    """Keeps PERIOD, and counts how late it was."""
+    """Keeps a period [s], and counts how late it was."""
 
-    def __init__(self) -> None:
+    def __init__(self, period: float) -> None:
+        self._period = period
         self._next = time.monotonic()
         self._late: list[float] = []
 
     def wait(self) -> None:
         """Until the next step is due."""
-        self._next += PERIOD
+        self._next += self._period
         now = time.monotonic()
         if now < self._next:
             time.sleep(self._next - now)

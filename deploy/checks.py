@@ -1,0 +1,99 @@
+"""What comes in from the robot: which frames are believed, and when there are too few of them."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+
+from deploy.codec import FrameError, RobotState, decode_state
+from deploy.policy import LOWER, UPPER
+from deploy.settings import InputCfg
+
+_WRAP = 2**32
+_RESTART = 1000  # ms that the robot's clock may seem to go back before the robot has restarted
+
+
+class StateChecks:
+    """Judges state frames one by one: a bad one is dropped and counted, too many in a row are a fault.
+
+    Attributes:
+        counts: frames by what was wrong with them, and "gap" for the frames that never came.
+        ms: the robot's clock at the last good frame, without its overflow [ms].
+        heard: when that came [s]; -inf before the first.
+
+    Args:
+        cfg: limits.
+    """
+
+    def __init__(self, cfg: InputCfg):
+        self.cfg = cfg
+        self.counts: Counter[str] = Counter()
+        self.ms = 0
+        self.heard = -math.inf
+        self._fault = ""
+        self._last = ""
+
+    def take(self, frame: bytes, now: float) -> RobotState | None:
+        """The state in a frame that came `now` [s], or None if it is not believed."""
+        try:
+            state = decode_state(frame)
+        except FrameError:
+            self._refuse("no LowState frame")
+            return None
+        ahead = (state.tick - self.ms + _WRAP // 2) % _WRAP - _WRAP // 2
+        first = not math.isfinite(self.heard)
+        wrong = "" if state.crc_ok else "checksum"
+        if wrong := wrong or self._range(state) or ("" if first else self._order(ahead)):
+            self._refuse(wrong)
+            return None
+        if first:
+            self.ms = state.tick
+        else:
+            self.counts["gap"] += ahead // 2 - 1
+            self.ms += ahead
+        self.heard = now
+        if (hottest := int(state.temperature.max())) > self.cfg.temperature:
+            self._fault = f"a motor has {hottest} deg C, allowed are {self.cfg.temperature:g}: let it cool"
+        return state
+
+    def fault(self, now: float) -> str:
+        """Why the robot cannot be believed any more; "" while it can."""
+        if self._fault:
+            return self._fault
+        if now - self.heard <= self.cfg.max_age:
+            return ""
+        age = f"for {1e3 * (now - self.heard):.0f} ms" if math.isfinite(self.heard) else "yet"
+        last = f" (the last one refused: {self._last})" if self._last else ""
+        return f"no good state frame {age}{last}"
+
+    def _refuse(self, reason: str) -> None:
+        self.counts[reason] += 1
+        self._last = reason
+
+    def _order(self, ahead: int) -> str:
+        """What is wrong with a frame so many ms after the last good one."""
+        if ahead < -_RESTART:
+            self._fault = f"the robot's clock went back by {-ahead} ms: it restarted"
+        return "repeated" if ahead == 0 else "out of order" if ahead < 0 else ""
+
+    def _range(self, state: RobotState) -> str:
+        """What of a frame cannot be; comparisons are written so that NaN fails them."""
+        cfg = self.cfg
+        numbers = (state.quat, state.gyro, state.acc, state.q, state.dq, state.tau)
+        if not all(math.isfinite(float(values.sum())) for values in numbers):
+            return "not a number"
+        if not 0.9 < float(state.quat @ state.quat) < 1.1:
+            return "range of the attitude"
+        if not np.abs(state.gyro).max() <= cfg.gyro:
+            return "range of the gyroscope"
+        if not np.abs(state.acc).max() <= cfg.acc:
+            return "range of the accelerometer"
+        if not np.maximum(LOWER - state.q, state.q - UPPER).max() <= cfg.joint_margin:
+            return "range of the joints"
+        if not np.abs(state.dq).max() <= cfg.joint_speed:
+            return "range of the joint speeds"
+        if not np.abs(state.tau).max() <= cfg.torque:
+            return "range of the torques"
+        return ""

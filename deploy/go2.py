@@ -1,0 +1,229 @@
+"""The Go2 under the planner: `python deploy/go2.py` on a stand-in, `--interface eth0` on the robot."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[0] = str(ROOT)  # not this folder, whose modules are deploy's
+
+import tyro  # noqa: E402
+from rich.console import Console  # noqa: E402
+
+from deploy.buttons import Operator, Port  # noqa: E402
+from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
+from deploy.log import pipe  # noqa: E402
+from deploy.loop import policies  # noqa: E402
+from deploy.process import ENVIRONMENT, Job, spawn  # noqa: E402
+from deploy.settings import DeployCfg  # noqa: E402
+from deploy.slots import Board  # noqa: E402
+from deploy.view import View  # noqa: E402
+from hmc.cfg import load  # noqa: E402
+from hmc.cli import one_line_errors  # noqa: E402
+
+LOOK = 0.05  # s
+START_UP = 60.0  # s for a process to be ready
+DAMPED = 0.5  # s of the watchdog's damping after the control process
+
+
+@dataclass(frozen=True)
+class Args:
+    """Foot stand, flip, handstand. Without arguments: on a stand-in for the robot, which is started beside.
+
+    On a robot, the operator has the remote: START goes on to the next phase, SELECT lies down or damps,
+    L2 and B damp at once. docs/deploy.md has the checklist.
+
+    Attributes:
+        interface: the robot's network interface; lo is the stand-in's.
+        domain: of DDS; default: 0 on a robot, 1 on lo.
+        dry_run: compute and log, but never command.
+        release: let the robot's own controller be stopped; its legs give way: lay it down before.
+        out: folder for the log and the summary.
+        seed: of the stand-in and of the planner's draws.
+        robot: further arguments of tools/go2_robot.py, such as "--robot.state-delay 0.002".
+        foot: policy file of the foot stand; default: the one that comes with the package.
+        hand: policy file of the handstand, likewise.
+        set: overrides of cfg/deploy.toml, such as plan.lead=100.
+        task_set: overrides of the task in cfg/flip.toml, such as substeps=2.
+        search: overrides of cfg/planner.toml, such as search.draws=16.
+        threads: of the planner's engine; 0 for all cores.
+        speed: of the stand-in's clock, for slow motion where the machine is busy; 1 on a robot.
+    """
+
+    interface: str = LOOPBACK
+    domain: int | None = None
+    dry_run: bool = False
+    release: bool = False
+    out: Path = ROOT / "out" / "deploy"
+    seed: int = 0
+    robot: str = ""
+    foot: str = ""
+    hand: str = ""
+    set: tuple[str, ...] = ()
+    task_set: tuple[str, ...] = ()
+    search: tuple[str, ...] = ()
+    threads: int = 0
+    speed: float = 1.0
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the robot is the stand-in."""
+        return self.interface == LOOPBACK
+
+    def job(self) -> Job:
+        """What every process is told."""
+        domain = (
+            self.domain if self.domain is not None else SIMULATION_DOMAIN if self.simulated else ROBOT_DOMAIN
+        )
+        return Job(
+            domain=domain,
+            interface=self.interface,
+            set=self.set,
+            dry_run=self.dry_run,
+            release=self.release or self.simulated,
+            foot=self.foot,
+            hand=self.hand,
+            task_set=self.task_set,
+            search=self.search,
+            seed=self.seed,
+            threads=self.threads,
+            speed=self.speed,
+        )
+
+
+class Ended(RuntimeError):
+    """A process ended that should not have; its exit status."""
+
+    def __init__(self, name: str, status: int):
+        super().__init__(f"{name} ended with status {status}")
+        self.status = status
+
+
+@contextlib.contextmanager
+def stand_in(args: Args, domain: int) -> Iterator[Port]:
+    """The stand-in as a process, lying; its truth goes to truth.npz when it ends."""
+    command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--robot.start", "lying"]
+    command += ["--robot.seed", str(args.seed), "--log", str(args.out / "truth.npz")]
+    command += ["--speed", str(args.speed), *args.robot.split()]
+    # a session of its own: Ctrl-C is ours to pass on, when the robot has been damped
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        port = re.search(r"orders at UDP port (\d+)", _ready(process, "the stand-in"))
+        assert port
+        orders = Port(int(port[1]))
+        yield orders
+        orders.close()
+    finally:
+        _end(process)
+
+
+def _ready(process: subprocess.Popen[str], name: str) -> str:
+    """The line in which a process says that it is ready."""
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line.startswith("ready"):
+        raise Ended(name, process.wait())
+    return line
+
+
+def _end(process: subprocess.Popen[str], wait: float = 10.0) -> None:
+    process.terminate()
+    try:
+        process.wait(wait)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+def _end_all(processes: list[subprocess.Popen[str]]) -> None:
+    for process in processes:
+        _end(process)
+
+
+def run(args: Args, console: Console, port: Port | None) -> None:
+    """Start all processes, show the run until it is over, end them so that the robot stays damped."""
+    board, (source, sink) = Board(), pipe()
+    job = args.job()
+    base = {**vars(job), "board": board.descriptor}
+    with contextlib.ExitStack() as stack:
+        stack.callback(board.close)
+        log = spawn("log", Job(**{**base, "log": source, "path": str(args.out / "run.mcap")}), [source])
+        stack.callback(log.wait)  # it ends when the control process has
+        os.close(source)
+        watch: list[subprocess.Popen[str]] = []
+        stack.callback(_end_all, watch)
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE}
+        control = spawn("loop", Job(**{**base, "log": sink}), [board.descriptor, sink], **pipes)
+        os.close(sink)
+        stack.callback(time.sleep, DAMPED)
+        stack.callback(_end, control)
+        console.print(f"control process: {_ready(control, 'the control process').strip()}", highlight=False)
+        if not args.dry_run:
+            watch.append(spawn("watchdog", Job(**{**base, "pid": control.pid}), [board.descriptor]))
+        planner = spawn("planner", Job(**base), [board.descriptor])
+        stack.callback(_end, planner)
+        operator = Operator(port) if port is not None else None
+        follow(board, control, operator, stack.enter_context(View(console)))
+
+
+def follow(board: Board, control: subprocess.Popen[str], operator: Operator | None, view: View) -> None:
+    """Show the status until the control process ends, or the operator in simulation says that it is over."""
+    while control.poll() is None:
+        time.sleep(LOOK)
+        status = board.status.read()
+        if status is None:
+            continue
+        view.show(status)
+        if operator is not None and operator.see(status):
+            return
+
+
+def main(args: Args) -> int:
+    """Run, summarise, return the exit status: 0 for all stages, 1 for fewer, 2 where it could not start."""
+    console = Console()
+    with one_line_errors():
+        load(args.job().cfg, DeployCfg, args.set)
+        policies(args.foot, args.hand)
+        if not 0 < args.speed <= 1 or (args.speed != 1 and not args.simulated):
+            raise ValueError(
+                f"speed is above 0 and at most 1 on the stand-in, 1 on a robot; got {args.speed:g}"
+            )
+        args.out.mkdir(parents=True, exist_ok=True)
+        for name in ("run.mcap", "truth.npz", "summary.json"):
+            (args.out / name).unlink(missing_ok=True)
+    truth = args.out / "truth.npz" if args.simulated else None
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            if args.simulated:
+                with stand_in(args, args.job().domain) as port:
+                    run(args, console, port)
+            else:
+                run(args, console, None)
+    except Ended as ended:
+        # what was wrong, the process has said itself
+        return 2 if ended.status in (1, 2) else 1
+    from deploy.summary import summarise, write  # loads torch: seconds that the start need not wait for
+
+    with one_line_errors():
+        summary = summarise(args.out / "run.mcap", truth)
+    write(args.out / "summary.json", summary)
+    console.print_json(data=summary)
+    reached = summary["stages_true"] if args.simulated else summary["stages"]
+    return 0 if reached and reached["success"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Args)))

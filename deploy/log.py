@@ -1,0 +1,196 @@
+"""The log: what the control process hands over at once, and the process that writes it to an MCAP file.
+
+The control process puts records into a pipe of 1 MB that never makes it wait; a record that does not fit is
+counted and lost. Records end up on these topics:
+
+================= ============================================================================================
+rt/lowstate       every state frame as it came, CDR of unitree_go.msg.dds_.LowState_ (deploy.codec reads it)
+rt/lowcmd         every command that differs from the one before it, CDR of unitree_go.msg.dds_.LowCmd_
+tick              JSON, every control step: estimate, covariance, phase, mode, targets, lateness; see TICK
+plan              JSON, every plan that came
+event             JSON, phases, faults and whatever else happened
+================= ============================================================================================
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from deploy.process import Job, told, until_told
+
+VERSION = "1"
+METADATA = "hmc"
+STATE, COMMAND, TICK_RECORD, PLAN, EVENT = range(5)
+TOPICS = ("rt/lowstate", "rt/lowcmd", "tick", "plan", "event")
+PIPE = 1 << 20  # octets
+
+# A control step; see deploy.estimate.Estimate for x and the error's order in variance.
+TICK = np.dtype(
+    [
+        ("k", "i8"),
+        ("ms", "i8"),  # the robot's clock
+        ("phase", "i4"),
+        ("mode", "i4"),
+        ("plan", "i8"),
+        ("late", "f8"),  # ms
+        ("compute", "f8"),  # ms from the frame's arrival until the command left
+        ("x", "f8", 37),
+        ("variance", "f8", 27),
+        ("u", "f8", 12),
+        ("contact", "i4", 4),
+    ]
+)
+_HEAD = struct.Struct("<IBq")  # octets that follow, kind, wall clock [ns]
+_LARGEST = 4096 - _HEAD.size  # a pipe takes up to 4096 octets whole or not at all
+
+
+class LogError(ValueError):
+    """A file that is no log of this version."""
+
+
+class Recorder:
+    """The control process's end of the pipe.
+
+    Attributes:
+        lost: records that did not fit.
+
+    Args:
+        descriptor: of the pipe's end to write to; -1 for no log.
+    """
+
+    def __init__(self, descriptor: int):
+        self.lost = 0
+        self._descriptor = descriptor
+        if descriptor >= 0:
+            os.set_blocking(descriptor, False)
+
+    def add(self, kind: int, octets: bytes) -> None:
+        """Hand a record over."""
+        if self._descriptor < 0:
+            return
+        if len(octets) > _LARGEST:
+            self.lost += 1
+            return
+        try:
+            os.write(self._descriptor, _HEAD.pack(len(octets), kind, time.time_ns()) + octets)
+        except (BlockingIOError, BrokenPipeError):
+            self.lost += 1
+
+    def event(self, what: str, **fields: Any) -> None:
+        """Hand over that something happened."""
+        self.add(EVENT, json.dumps({"what": what, **fields}).encode()[:_LARGEST])
+
+
+def pipe() -> tuple[int, int]:
+    """Descriptors of a pipe's ends, to read from and to write to, of PIPE octets where the kernel permits."""
+    ends = os.pipe()
+    with suppress(PermissionError):
+        fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, PIPE)
+    return ends
+
+
+def write(source: BinaryIO, path: Path, about: dict[str, str]) -> None:
+    """Write the records of a pipe to an MCAP file until the pipe ends.
+
+    Args:
+        source: to read from.
+        path: of the file.
+        about: goes into the file's metadata.
+    """
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="hmc")
+        writer.add_metadata(METADATA, {"version": VERSION, **about})
+        schema = json.dumps({"type": "object"}).encode()
+        channels = []
+        for kind, topic in enumerate(TOPICS):
+            as_json = kind not in (STATE, COMMAND)
+            number = writer.register_schema(topic, "jsonschema", _schema(kind) or schema) if as_json else 0
+            channels.append(writer.register_channel(topic, "json" if as_json else "cdr", number))
+        counts = [0] * len(TOPICS)
+        while len(head := source.read(_HEAD.size)) == _HEAD.size:
+            size, kind, stamp = _HEAD.unpack(head)
+            if len(octets := source.read(size)) < size or kind >= len(TOPICS):
+                break
+            if kind == TICK_RECORD:
+                octets = json.dumps(tick_fields(np.frombuffer(octets, TICK)[0])).encode()
+            writer.add_message(channels[kind], stamp, octets, stamp, counts[kind])
+            counts[kind] += 1
+        writer.finish()
+
+
+def tick_fields(tick: Any) -> dict[str, Any]:
+    """A control step as JSON takes it: numbers and lists."""
+    return {name: tick[name].tolist() for name in TICK.names or ()}
+
+
+def read(path: Path) -> Iterator[tuple[str, float, Any]]:
+    """Topic, wall clock [s] and content of each record of a log: octets of frames, objects of JSON.
+
+    Raises:
+        LogError: not a log of this version; names what it is.
+    """
+    if not path.is_file():
+        raise LogError(f"log {path}: no such file")
+    with path.open("rb") as file:
+        try:
+            reader = make_reader(file)
+            found = {record.name: record.metadata for record in reader.iter_metadata()}
+        except (McapError, ValueError, struct.error, EOFError) as error:
+            raise LogError(
+                f"log {path}: not a whole MCAP file ({type(error).__name__} {error}): a run that was cut "
+                "short leaves one that `mcap recover` can mend"
+            ) from None
+        version = found.get(METADATA, {}).get("version", "none")
+        if version != VERSION:
+            raise LogError(
+                f"log {path}: is of version {version}, expected {VERSION}: take the hmc that wrote it"
+            )
+        try:
+            for _, channel, message in reader.iter_messages():
+                is_json = channel.message_encoding == "json"
+                yield (
+                    channel.topic,
+                    1e-9 * message.log_time,
+                    json.loads(message.data) if is_json else message.data,
+                )
+        except (McapError, ValueError, struct.error, EOFError) as error:
+            raise LogError(f"log {path}: damaged ({type(error).__name__} {error})") from None
+
+
+def _schema(kind: int) -> bytes:
+    """JSON schema of a topic whose layout is fixed; empty for others."""
+    if kind != TICK_RECORD:
+        return b""
+    properties: dict[str, Any] = {}
+    for name in TICK.names or ():
+        field = TICK[name]
+        one = {"type": "integer" if field.base.kind == "i" else "number"}
+        properties[name] = one
+        for size in field.shape:
+            properties[name] = {"type": "array", "items": one, "minItems": size, "maxItems": size}
+    return json.dumps({"type": "object", "properties": properties, "required": list(properties)}).encode()
+
+
+def main(job: Job, about: Callable[[], dict[str, str]] = dict) -> None:
+    """Be the log's process until the control process has ended; SIGTERM is not needed and does nothing."""
+    until_told(parent_matters=False)
+    with os.fdopen(job.log, "rb") as source:
+        write(source, Path(job.path), {"domain": str(job.domain), "interface": job.interface, **about()})
+
+
+if __name__ == "__main__":
+    main(told())

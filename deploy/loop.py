@@ -1,0 +1,278 @@
+"""The control process: frames of the wire through `Control`, with slots, log and clock around it.
+
+A command leaves after every state frame, not every tick: one that is lost is made good within 2 ms, not 20,
+and a robot that damps itself when it hears nothing hears enough. Between ticks it is the same frame.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from deploy.codec import decode_state
+from deploy.control import Control
+from deploy.dds import Link, LinkError, Subscriber
+from deploy.log import COMMAND, PLAN, STATE, TICK, TICK_RECORD, Recorder
+from deploy.messages import LowCmd_, LowState_
+from deploy.modes import FOOT, HAND, NAMES, Plan
+from deploy.motion_switcher import MotionSwitcher, MotionSwitcherError
+from deploy.observe import pitch
+from deploy.policy import Policy
+from deploy.process import ROOT, Job, real_time, told, until_told
+from deploy.safety import Phase
+from deploy.settings import DeployCfg, InputCfg
+from deploy.slots import Board, said, text
+from deploy.timing import Lateness
+from hmc.cfg import load
+
+PRIORITY = 50
+WAIT = 0.005  # s for a frame
+HEARD = 3.0  # s for the first one
+COMPANY = 0.4  # s for other controllers to be found
+LAST = 0.3  # s of damping before a program that is told to end does
+_PRESENCE = 1.0  # s without a word of a planner that waits
+
+
+class Refusal(RuntimeError):
+    """The robot is not in a state to be started; says what to do."""
+
+
+def preflight(link: Link, states: Subscriber, cfg: InputCfg, release: bool) -> None:
+    """See that the robot is there, alone, free and charged.
+
+    Raises:
+        Refusal: it is not.
+    """
+    frames = states.take(HEARD)
+    if not frames:
+        why = (
+            "something publishes rt/lowstate, but is silent: is the robot asleep?"
+            if states.peers
+            else "nobody publishes rt/lowstate: is the robot on and its cable in, and are the interface and "
+            "the DDS domain right (0 on the robot's network, 1 on lo for the stand-in)?"
+        )
+        raise Refusal(f"no state frame within {HEARD:g} s; {why}")
+    time.sleep(COMPANY)
+    if others := link.rivals("rt/lowcmd"):
+        raise Refusal(f"another program commands the motors: {', '.join(others)}: end it first")
+    if (charge := decode_state(frames[-1]).charge) < cfg.min_charge:
+        raise Refusal(f"the battery has {charge} %, at least {cfg.min_charge} % is needed: charge it")
+    try:
+        switcher = MotionSwitcher(link)
+        if (name := switcher.active()) and release:
+            switcher.release()
+        elif name:
+            raise Refusal(f"the robot's own controller {name!r} runs: lay the robot down, then use --release")
+    except MotionSwitcherError as error:
+        raise Refusal(str(error)) from None
+
+
+class Loop:
+    """The control process's loop.
+
+    Args:
+        link: to the robot.
+        states: of the robot.
+        board: slots.
+        control: what decides.
+        recorder: of the log.
+        dry_run: command nothing.
+        speed: of the robot's clock.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        states: Subscriber,
+        board: Board,
+        control: Control,
+        recorder: Recorder,
+        dry_run: bool,
+        speed: float = 1.0,
+    ):
+        self._link, self._states, self._board = link, states, board
+        self._control, self._recorder, self._dry_run = control, recorder, dry_run
+        self._speed = speed
+        self._commands = None if dry_run else link.publisher("rt/lowcmd", LowCmd_)
+        self._lateness = Lateness()
+        self._phase, self._hint, self._logged = Phase.PASSIVE, "", b""
+        self._plans = 0  # number of the slot's value read last
+        self._company = 0.0  # when other controllers were looked for [s]
+        self._began = time.monotonic()
+        self._silent = False
+
+    def turn(self) -> None:
+        """Wait for state frames, command, tell the others."""
+        control, board = self._control, self._board
+        frames = self._states.take(WAIT)
+        now = time.monotonic()
+        self._listen(now)
+        ticked = False
+        for frame in frames:
+            ticked = control.hear(frame, now) or ticked
+            self._recorder.add(STATE, frame)
+        if not frames:
+            control.idle(now)
+        command = control.command
+        if command is not None and self._commands is not None and not self._silent:
+            self._commands.write(command)
+        left = time.monotonic()
+        heart = board.heart.blank()
+        heart["t"], heart["commanding"] = left, command is not None and not self._dry_run
+        heart["latched"], heart["reason"] = control.phase == Phase.DAMPING, text(control.machine.reason)
+        board.heart.write(heart)
+        if command is not None and command != self._logged:
+            self._recorder.add(COMMAND, command)
+            self._logged = command
+        if ticked:
+            self._tell(now, left)
+        if control.phase != self._phase or control.machine.hint != self._hint:
+            self._phase, self._hint = control.phase, control.machine.hint
+            why = control.machine.reason or self._hint
+            self._recorder.event("phase", phase=self._phase.name.lower(), k=control.k, reason=why)
+
+    def _listen(self, now: float) -> None:
+        """Read what the watchdog and the planner have to say."""
+        control, board = self._control, self._board
+        guard = board.guard.read()
+        if guard is not None and guard["latched"] and not self._silent:
+            self._silent = True  # the watchdog damps the robot by now, and two must not command
+            control.fail(said(guard["reason"].item()))
+        if not self._dry_run:
+            control.wait = "the watchdog has not started yet" if guard is None else ""
+            if guard is not None and now - float(guard["t"]) > control.cfg.watchdog.lost:
+                control.fail("the watchdog does not live any more")
+        if board.plan.count != self._plans:
+            self._plans = board.plan.count
+            record = board.plan.read()
+            if record is not None and record["number"] > 0:
+                self._take(record)
+        told = board.plan.read() if control.phase == Phase.READY else None
+        control.planner = told is not None and now - float(told["t"]) < _PRESENCE
+        if now - self._company > 1.0:
+            self._company = now
+            ours = () if guard is None else (int(guard["pid"]),)
+            if others := self._link.rivals("rt/lowcmd", ours):
+                control.fail(f"another program commands the motors: {others[0]}")
+
+    def _take(self, record: np.ndarray) -> None:
+        """A plan has come."""
+        try:
+            plan = Plan.read(record)
+        except ValueError as error:
+            self._recorder.event("bad plan", reason=str(error))
+            return
+        self._control.performer.offer(plan)
+        fields = {
+            "number": plan.number,
+            "base": plan.base,
+            "begin": plan.begin,
+            "k": self._control.k,
+            "modes": "".join(str(mode) for mode in plan.modes),
+            "cost": round(float(record["cost"]), 4),
+            "seconds": round(float(record["seconds"]), 4),
+        }
+        self._recorder.add(PLAN, json.dumps(fields).encode())
+
+    def _tell(self, now: float, left: float) -> None:
+        """Tell planner, view and log of a tick."""
+        control, performer = self._control, self._control.performer
+        late = self._lateness.add(0.001 * control.due_ms / self._speed, left)
+        if control.phase == Phase.HYBRID:
+            control.situation["t"] = now
+            self._board.state.write(control.situation)
+        estimate, status = control.estimate, self._board.status.blank()
+        plan = performer.plan
+        status["t"], status["k"], status["phase"], status["mode"] = (
+            left,
+            control.k,
+            control.phase,
+            performer.mode,
+        )
+        status["plan_age"] = -1 if plan is None else control.k - plan.base
+        status["ticks"], status["missed"], status["late"] = (
+            len(self._lateness),
+            control.missed,
+            self._lateness.bins,
+        )
+        status["faults"] = sum(control.checks.counts.values())
+        status["plans"] = performer.counts["taken"]
+        status["late_plans"] = performer.counts["late"] + performer.counts["stale"]
+        status["charge"] = control.state.charge if control.state else 0
+        status["reason"] = text(control.machine.reason or control.machine.hint)
+        if estimate is not None:
+            status["pitch"], status["height"] = np.degrees(pitch(estimate.C[2])), estimate.x[2]
+        self._board.status.write(status)
+        tick = np.zeros((), TICK)
+        tick["k"], tick["ms"], tick["phase"], tick["mode"] = (
+            control.k,
+            control.checks.ms,
+            control.phase,
+            performer.mode,
+        )
+        tick["plan"], tick["late"], tick["compute"] = plan.number if plan else 0, late, 1e3 * (left - now)
+        tick["u"] = np.nan_to_num(control.target)
+        if estimate is not None:
+            tick["x"], tick["variance"], tick["contact"] = estimate.x, estimate.P.diagonal(), estimate.contact
+        self._recorder.add(TICK_RECORD, tick.tobytes())
+
+    def end(self) -> None:
+        """Damp the robot for a moment and say how it went; the watchdog goes on damping."""
+        control = self._control
+        control.fail("the program was told to end")
+        until = time.monotonic() + (LAST if control.command is not None else 0.0)
+        while time.monotonic() < until:
+            self.turn()
+        self._recorder.event(
+            "end",
+            phase=control.phase.name.lower(),
+            missed=control.missed,
+            faults=dict(control.checks.counts),
+            plans=dict(control.performer.counts),
+            lost=self._recorder.lost,
+        )
+
+
+def policies(foot: str, hand: str) -> dict[int, Policy]:
+    """The policies of the modes that have one; ValueError if a file is not for this robot."""
+    given = {FOOT: foot, HAND: hand}
+    own = {mode: ROOT / "hmc" / "go2" / "policies" / f"{NAMES[mode]}stand.onnx" for mode in given}
+    return {mode: Policy(Path(path) if path else own[mode]) for mode, path in given.items()}
+
+
+def run(job: Job, stopped: Callable[[], bool]) -> None:
+    """Control the robot until `stopped()`."""
+    cfg = load(job.cfg, DeployCfg, job.set)
+    cfg = replace(cfg, input=replace(cfg.input, max_age=cfg.input.max_age / job.speed))
+    control = Control(cfg, policies(job.foot, job.hand))
+    quick = real_time(PRIORITY)
+    link = Link(job.domain, job.interface)
+    states = link.subscriber("rt/lowstate", LowState_)
+    preflight(link, states, cfg.input, job.release)
+    loop = Loop(link, states, Board(job.board), control, Recorder(job.log), job.dry_run, job.speed)
+    print(f"ready: {'real-time' if quick else 'normal'} priority", flush=True)
+    states.take()  # those that came meanwhile are old
+    while not stopped():
+        loop.turn()
+    loop.end()
+
+
+def main(job: Job) -> int:
+    """Be the control process until SIGTERM; exit status 2 and one line if the robot cannot be started."""
+    stopped = until_told()
+    try:
+        run(job, stopped)
+    except (Refusal, LinkError, ValueError) as error:
+        print(f"go2: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(told()))

@@ -1,0 +1,262 @@
+"""The planner's process: newest state in, plan for a later tick out; nobody waits for it."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from deploy.modes import FOOT, HAND, JUMP, NAMES, NONE, due
+from deploy.process import ROOT, Job, allowed, told, until_told
+from deploy.settings import DeployCfg, PlanCfg
+from deploy.slots import PLAN, STEPS, Board
+from hmc import Evaluator, Schedule, Task, Trace, make_start, plan
+from hmc.cfg import load
+from hmc.go2.model import DT
+from hmc.go2.stances import FOOTSTAND, HANDSTAND
+from hmc.go2.task import FlipCfg, flip_task
+from hmc.receding import SearchCfg
+from hmc.start import Start
+
+NICE = 5  # where what controls the robot may not have a real-time priority
+_KEPT = 40  # plans that the control process may still be running
+
+
+@dataclass(frozen=True)
+class PlannerCfg:
+    """cfg/planner.toml.
+
+    Attributes:
+        lead: control steps from a plan's begin until the handstand is wanted, while the first way to it is
+            looked for.
+        first: effort of a plan then: the robot stands and can wait.
+        search: effort of every other plan.
+    """
+
+    lead: int = 45
+    first: SearchCfg = field(default_factory=SearchCfg)
+    search: SearchCfg = field(default_factory=SearchCfg)
+
+
+@dataclass(frozen=True, eq=False)
+class Shipped:
+    """A plan that was sent.
+
+    Attributes:
+        begin: tick of its first step.
+        trace: what it leads to.
+    """
+
+    begin: int
+    trace: Trace
+
+
+class Planner:
+    """Plans from the state that the running plan will have led to when the new one is ready.
+
+    Until the operator asks for the handstand, the whole horizon wants the foot stand. From then on,
+    the moment at which the handstand is wanted moves along ahead of the robot, until a schedule is
+    found that ends in it; then it stays where it is, and the plan is sent. A plan that leaves the foot
+    stand for anything but a handstand is not sent: the robot stands, and the search begins anew.
+
+    Attributes:
+        task: what is planned.
+        seconds: that the last plans took [s].
+
+    Args:
+        task: settings of the task.
+        cfg: effort.
+        rules: of taking plans over.
+        seed: of the draws and of the jump's noise.
+        threads: of the engine; 0 for all cores.
+        speed: of the robot's clock.
+    """
+
+    def __init__(
+        self,
+        task: FlipCfg,
+        cfg: PlannerCfg,
+        rules: PlanCfg,
+        *,
+        seed: int = 0,
+        threads: int = 0,
+        speed: float = 1.0,
+    ):
+        self._horizon, self._tick = task.horizon, DT / speed
+        if not cfg.lead < self._horizon <= STEPS:
+            raise ValueError(
+                f"horizon must be more than the lead of {cfg.lead} control steps and at most {STEPS}, "
+                f"got {self._horizon}"
+            )
+        # in the task's own time, later than the end of a horizon that begins at 0
+        self._wanted = self._horizon + 1
+        self.task: Task = flip_task(replace(task, command=self._wanted), seed=seed, threads=threads)
+        if self.task.modes.names != NAMES:
+            raise ValueError(f"modes must be {', '.join(NAMES)}, got {', '.join(self.task.modes.names)}")
+        self.seconds: deque[float] = deque([0.1] * 5, maxlen=30)
+        self._cfg, self._rules, self._seed = cfg, rules, seed
+        searches = (cfg.first, cfg.search)
+        self._sim = self.task.make_sim(1 + max(max(it.samples, it.pairs + it.moves) for it in searches))
+        self._one = self.task.make_sim(1)
+        self._shipped: dict[int, Shipped] = {}
+        self._number = 0
+        self._command: int | None = None  # tick from which the handstand is wanted
+        self._guess = [FOOT] * self._horizon  # incumbent while that is not known
+        self._known = False  # whether the guess ended in the handstand
+
+    def warm(self) -> None:
+        """Plan once for nothing: what is made on first use is made then."""
+        x = FOOTSTAND.state()
+        start = make_start(self.task, self._sim, x, x[7:19], k=self._wanted)
+        flip = [FOOT] * 10 + [JUMP] * 35 + [HAND] * (self._horizon - 45)
+        plan(self.task, start, schedule=flip, sim=self._sim, **self._cfg.search.options())
+
+    @property
+    def ahead(self) -> int:
+        """Ticks that planning is expected to take."""
+        expected = float(np.quantile(self.seconds, self._rules.quantile))
+        return min(1 + math.ceil(expected / self._tick), self._rules.longest)
+
+    @torch.no_grad()
+    def plan(self, state: np.ndarray, ahead: int) -> np.ndarray | None:
+        """The plan for `ahead` ticks after a state, as a value of the plan's slot; None if there is none.
+
+        Args:
+            state: value of the state's slot.
+            ahead: ticks.
+        """
+        begin = int(state["k"]) + ahead
+        start, modes = self._predict(state, ahead)
+        if not bool(start.x.isfinite().all()):
+            return None
+        searching = int(state["asked"]) >= 0 and start.mode == FOOT and self._command is None
+        if int(state["asked"]) < 0:
+            return self._ship(state, begin, start, self._follow(start, [FOOT] * self._horizon))
+        if searching:
+            start = replace(start, k=self._wanted - self._cfg.lead)
+            effort, modes = self._cfg.search if self._known else self._cfg.first, self._guess
+        else:
+            command = begin if self._command is None else self._command
+            start = replace(start, k=max(0, begin - command + self._wanted))
+            effort = self._cfg.search
+        found = plan(
+            self.task,
+            start,
+            schedule=modes,
+            seed=(self._seed, begin),
+            sim=self._sim,
+            forget=False,
+            **effort.options(),
+        )
+        trace = found.known
+        if trace.schedule != found.schedule:
+            trace = self._follow(start, found.schedule.modes, trace)
+        reached = len(trace) == self._horizon and bool(HANDSTAND.held(trace.x[-1:]))
+        if start.mode != FOOT:
+            return self._ship(state, begin, start, trace)
+        if searching:
+            known, self._known, self._guess = self._known, reached, list(found.schedule)
+            if not (known and reached):
+                return None
+            self._command = begin + self._cfg.lead
+        elif not reached:
+            self._command, self._known, self._guess = None, False, list(found.schedule)
+            trace = self._follow(start, [FOOT] * self._horizon)
+        return self._ship(state, begin, start, trace)
+
+    def _follow(self, start: Start, modes: Sequence[int], known: Trace | None = None) -> Trace:
+        """What a schedule leads to."""
+        evaluator = Evaluator(self.task, self._sim, start, known)
+        return evaluator.trace(Schedule(tuple(modes), NAMES))
+
+    def _ship(self, state: np.ndarray, begin: int, start: Start, trace: Trace) -> np.ndarray | None:
+        """The value of the plan's slot for a schedule and what it leads to."""
+        if len(trace) < self._horizon:
+            return None
+        self._number += 1
+        self._shipped[self._number] = Shipped(begin, trace)
+        self._shipped.pop(self._number - _KEPT, None)
+        record = np.zeros((), PLAN)
+        record["number"], record["base"], record["begin"] = self._number, state["k"], begin
+        record["running"] = NONE if start.mode is None else start.mode
+        record["steps"], record["cost"] = len(trace), trace.cost
+        record["modes"][: len(trace)] = trace.modes
+        record["u"][: len(trace)] = trace.u[1:].numpy()
+        return record
+
+    def _predict(self, state: np.ndarray, ahead: int) -> tuple[Start, list[int]]:
+        """The situation `ahead` ticks later under the running plan, and its modes from there on."""
+        k, mode, entered = int(state["k"]), int(state["mode"]), int(state["entered"])
+        x, u = torch.from_numpy(state["x"].copy())[None], torch.from_numpy(state["u"].copy())[None]
+        running = self._shipped.get(int(state["plan"]))
+        begin, modes = (0, ()) if running is None else (running.begin, running.trace.modes)
+        memory = torch.from_numpy(state["anchor"].copy())[None]
+        self._one.reset(x, u)
+        for tick in range(k, k + ahead):
+            wanted, step = due(self._rules, begin, modes, tick, mode, entered), torch.tensor([tick])
+            if wanted == JUMP:
+                assert running is not None
+                row = tick - begin + 1
+                u, memory = running.trace.u[row][None], running.trace.memory[row][None]
+            else:
+                chosen = self.task.modes[wanted]
+                memory = chosen.reset(x, u, step) if wanted != mode else memory[:, : chosen.memory_size]
+                u, memory = chosen.act(x, u, memory, step)
+            if mode == JUMP and wanted == HAND and modes[tick - begin : tick - begin + 1] != (HAND,):
+                running, modes = None, ()  # as `Performer` does
+            mode, entered = wanted, tick if wanted != mode else entered
+            self._one.step(u)
+            x = self._one.x()
+        at = range(k + ahead - begin, k + ahead - begin + self.task.horizon)
+        schedule = [modes[min(max(i, 0), len(modes) - 1)] for i in at] if modes else [mode] * len(at)
+        return Start(x[0], u[0], mode, memory[0, : self.task.modes[mode].memory_size].to(x), 0), schedule
+
+
+def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
+    """Plan for every new state until `stopped()`."""
+    planner.warm()
+    last = -1
+    while not stopped():
+        state = board.state.read()
+        if state is None or not state["running"] or state["k"] == last:
+            if state is None or not state["running"]:
+                waiting = board.plan.blank()
+                waiting["t"] = time.monotonic()
+                board.plan.write(waiting)
+            time.sleep(0.002 if last >= 0 else 0.05)
+            continue
+        last = int(state["k"])
+        record = planner.plan(state, planner.ahead)
+        now = time.monotonic()
+        planner.seconds.append(now - float(state["t"]))
+        if record is not None:
+            record["t"], record["seconds"] = now, planner.seconds[-1]
+            board.plan.write(record)
+
+
+def main(job: Job) -> None:
+    """Be the planner until SIGTERM."""
+    stopped = until_told()
+    if not allowed():
+        os.nice(NICE)
+    torch.set_num_threads(1)
+    task = load(job.task, FlipCfg, job.task_set, table="task")
+    cfg, rules = (
+        load(ROOT / "cfg" / "planner.toml", PlannerCfg, job.search),
+        load(job.cfg, DeployCfg, job.set).plan,
+    )
+    run(
+        Board(job.board),
+        Planner(task, cfg, rules, seed=job.seed, threads=job.threads, speed=job.speed),
+        stopped,
+    )
+
+
+if __name__ == "__main__":
+    main(told())

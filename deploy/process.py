@@ -1,0 +1,118 @@
+"""What the processes of a run share: how they are started, how they end, and their priority."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+_PR_SET_PDEATHSIG = 1
+# matrices of 27 rows only lose by threads, which wait for each other in loops that fill a core
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a process of a run is told.
+
+    Attributes:
+        board: descriptor of the slots.
+        domain: of DDS.
+        interface: network interface.
+        cfg: settings file.
+        set: overrides of it.
+        pid: of the control process, for the watchdog.
+        log: descriptor of the log's pipe: written to by the control process, read by the log's.
+        path: of the log.
+        dry_run: compute and log, but command nothing.
+        release: let the robot's own controller be stopped.
+        foot, hand: policy files; empty for those that come with the package.
+        task: the planner's settings file.
+        task_set: overrides of its table `task`.
+        search: overrides of cfg/planner.toml.
+        seed: of the planner.
+        threads: of the planner's engine; 0 for all cores.
+        speed: of the robot's clock; not 1 in slow motion alone.
+    """
+
+    board: int = -1
+    domain: int = 1
+    interface: str = "lo"
+    cfg: str = str(ROOT / "cfg" / "deploy.toml")
+    set: tuple[str, ...] = ()
+    pid: int = 0
+    log: int = -1
+    path: str = ""
+    dry_run: bool = False
+    release: bool = False
+    foot: str = ""
+    hand: str = ""
+    task: str = str(ROOT / "cfg" / "flip.toml")
+    task_set: tuple[str, ...] = ()
+    search: tuple[str, ...] = ()
+    seed: int = 0
+    threads: int = 0
+    speed: float = 1.0
+
+
+def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:
+    """Start a module of `deploy` as a process that inherits these descriptors."""
+    command = [sys.executable, "-m", f"deploy.{module}", json.dumps(asdict(job))]
+    return subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, pass_fds=descriptors, text=True, **streams)
+
+
+def told() -> Job:
+    """The job that this process was started with."""
+    found: dict[str, Any] = json.loads(sys.argv[1])
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in found.items()
+    }
+    return Job(**values)
+
+
+def until_told(parent_matters: bool = True) -> Callable[[], bool]:
+    """Whether SIGTERM has come; the terminal's Ctrl-C is the parent's business.
+
+    Args:
+        parent_matters: whether the parent's death counts as SIGTERM: no process outlives the program.
+    """
+    came: list[int] = []
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    if parent_matters:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() == 1:
+            came.append(signal.SIGTERM)
+    return lambda: bool(came)
+
+
+def real_time(priority: int) -> bool:
+    """Ask the kernel for a real-time priority, before other threads start; whether it was granted.
+
+    What is loaded by now is not looked at by the garbage collector any more.
+    """
+    gc.collect()
+    gc.freeze()
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        return True
+    return False
+
+
+def allowed() -> bool:
+    """Whether the kernel grants real-time priorities to this user."""
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        return True
+    return False

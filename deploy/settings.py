@@ -1,0 +1,146 @@
+"""cfg/deploy.toml as frozen dataclasses: limits, ramps and times of the deployment, with their units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class InputCfg:
+    """What a state frame has to be like.
+
+    Attributes:
+        max_age: without a good frame for longer, the robot is damped [s].
+        gyro: largest reading [rad/s].
+        acc: largest reading [m/s^2].
+        joint_margin: how far an encoder may read beyond a joint's limits [rad].
+        joint_speed: largest reading [rad/s].
+        torque: largest reading [N m].
+        temperature: of a motor, at most [deg C].
+        min_charge: of the battery, to start with [%].
+    """
+
+    max_age: float = 0.06
+    gyro: float = 35.0
+    acc: float = 157.0
+    joint_margin: float = 0.35
+    joint_speed: float = 80.0
+    torque: float = 90.0
+    temperature: float = 85.0
+    min_charge: int = 20
+
+
+@dataclass(frozen=True)
+class EnvelopeCfg:
+    """Within what a phase or mode is as it should be.
+
+    A mode that begins somewhere else has `settle` to come into its pitch and height.
+
+    Attributes:
+        pitch: of the body, least and most: -90 nose up, 90 nose down [deg].
+        lean: of its plane of symmetry from the vertical, at most [deg].
+        height: of the base, least and most [m].
+        settle: time without limits of pitch and height after the mode's entry [s].
+        joint_speed: at most [rad/s].
+        torque: of a joint, relative to its motor's peak, at most.
+        velocity_std: of the estimated velocity, at most [m/s].
+        tilt_std: of the estimated attitude, at most [deg].
+        patience: how long a limit may be exceeded [s].
+    """
+
+    pitch: tuple[float, float] = (-180.0, 180.0)
+    lean: float = 60.0
+    height: tuple[float, float] = (-0.1, 2.0)
+    settle: float = 0.0
+    joint_speed: float = 45.0
+    torque: float = 1.5
+    velocity_std: float = 1.0
+    tilt_std: float = 10.0
+    patience: float = 0.03
+
+
+@dataclass(frozen=True)
+class EnvelopesCfg:
+    """An envelope for each phase and mode in which the motors are commanded."""
+
+    lie: EnvelopeCfg = field(default_factory=EnvelopeCfg)
+    stand: EnvelopeCfg = field(default_factory=EnvelopeCfg)
+    ready: EnvelopeCfg = field(default_factory=EnvelopeCfg)
+    foot: EnvelopeCfg = field(default_factory=EnvelopeCfg)
+    jump: EnvelopeCfg = field(default_factory=EnvelopeCfg)
+    hand: EnvelopeCfg = field(default_factory=EnvelopeCfg)
+
+
+@dataclass(frozen=True)
+class RampCfg:
+    """A slow motion of all joints into a pose, which is then held.
+
+    Attributes:
+        pose: hip, thigh, calf of every leg [rad].
+        seconds: duration [s].
+        kp: [N m/rad].
+        kd: [N m s/rad].
+    """
+
+    pose: tuple[float, float, float]
+    seconds: float
+    kp: float
+    kd: float
+
+
+@dataclass(frozen=True)
+class OutputCfg:
+    """Limits of what is commanded.
+
+    Attributes:
+        step: change of a joint's target from one control step to the next, at most [rad].
+        damping: gain while the robot is damped [N m s/rad].
+    """
+
+    step: float = 2.5
+    damping: float = 5.0
+
+
+@dataclass(frozen=True)
+class PlanCfg:
+    """How plans are taken over.
+
+    Attributes:
+        expires: control steps after a plan's begin from which on it starts no other mode.
+        jump: control steps that a jump may last.
+        quantile: of the planner's latest times that the next one is expected to take.
+        longest: control steps that are planned ahead for, at most.
+    """
+
+    expires: int = 40
+    jump: int = 60
+    quantile: float = 0.8
+    longest: int = 40
+
+
+@dataclass(frozen=True)
+class WatchdogCfg:
+    """The watchdog.
+
+    Attributes:
+        period: between two looks, and two damping commands [s].
+        hang: age of the control process's heartbeat at which it counts as hung [s].
+        lost: age of the watchdog's own at which the control process damps [s].
+    """
+
+    period: float = 0.004
+    hang: float = 0.07
+    lost: float = 0.5
+
+
+@dataclass(frozen=True)
+class DeployCfg:
+    """cfg/deploy.toml."""
+
+    lie: RampCfg = RampCfg((0.0, 1.36, -2.65), 1.5, 30.0, 2.0)
+    stand: RampCfg = RampCfg((0.0, 0.9, -1.8), 2.0, 60.0, 4.0)
+    input: InputCfg = field(default_factory=InputCfg)
+    output: OutputCfg = field(default_factory=OutputCfg)
+    envelope: EnvelopesCfg = field(default_factory=EnvelopesCfg)
+    plan: PlanCfg = field(default_factory=PlanCfg)
+    watchdog: WatchdogCfg = field(default_factory=WatchdogCfg)

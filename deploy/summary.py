@@ -1,0 +1,100 @@
+"""What a run came to, from its log; and, where the robot was a stand-in, from what really happened."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from deploy.control import TICK
+from deploy.log import read
+from deploy.modes import HAND, NAMES, NONE
+from deploy.safety import Phase
+from hmc.go2.model import DT
+from hmc.go2.stages import judge
+
+
+def summarise(log: Path, truth: Path | None = None) -> dict[str, Any]:
+    """Stages, ticks, lateness, plans, faults and the end of a run.
+
+    Args:
+        log: of the control process.
+        truth: of the stand-in, an .npz file; None on a robot.
+
+    Raises:
+        LogError: not a log of this version.
+    """
+    ticks: list[dict[str, Any]] = []
+    plans: list[dict[str, Any]] = []
+    events: list[dict[str, Any]] = []
+    into = {"tick": ticks, "plan": plans, "event": events}
+    for topic, _, content in read(log):
+        if topic in into:
+            into[topic].append(content)
+    hybrid = [tick for tick in ticks if tick["phase"] == Phase.HYBRID]
+    end = next((event for event in events if event["what"] == "end"), {})
+    reasons = [event["reason"] for event in events if event["what"] == "phase" and event["reason"]]
+    late = np.array([tick["late"] for tick in ticks] or [0.0])
+    quantiles = (0.5, 0.99, 0.999, 1.0)
+    percentiles = dict(
+        zip(("p50", "p99", "p99.9", "max"), np.quantile(late, quantiles).round(3).tolist(), strict=True)
+    )
+    seconds = [plan["seconds"] for plan in plans] or [0.0]
+    compute = [tick["compute"] for tick in ticks] or [0.0]
+    return {
+        "stages": stages(np.array([tick["x"] for tick in hybrid]), [tick["mode"] for tick in hybrid]),
+        "stages_true": None if truth is None else _true(truth, hybrid),
+        "ticks": len(ticks),
+        "missed": end.get("missed"),
+        "late_ms": percentiles,
+        "compute_ms_p50": round(float(np.median(compute)), 3),
+        "plans": len(plans),
+        "plans_per_s": round(len(plans) / max(DT * len(hybrid), DT), 1),
+        "plan_s": dict(
+            zip(("p50", "p90", "max"), np.quantile(seconds, (0.5, 0.9, 1.0)).round(3).tolist(), strict=True)
+        ),
+        "plans_used": end.get("plans"),
+        "faults": end.get("faults"),
+        "lost_records": end.get("lost"),
+        "modes": _runs(hybrid),
+        "end": end.get("phase"),
+        "reasons": reasons,
+    }
+
+
+def stages(x: np.ndarray, modes: list[int]) -> dict[str, bool] | None:
+    """Stages of the flip in states (n, 37) and the modes chosen at them; None for no states."""
+    if len(x) < 2:
+        return None
+    states = torch.from_numpy(np.vstack([x, x[-1:]]))
+    found = judge(states, torch.tensor(modes), DT, HAND)
+    return {**vars(found), "success": found.success}
+
+
+def _true(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, bool] | None:
+    """Stages of what really happened at the ticks of the hybrid phase."""
+    with np.load(path) as truth:
+        row = {int(tick): i for i, tick in enumerate(truth["tick"])}
+        known = [tick for tick in hybrid if tick["ms"] in row]
+        rows = [row[tick["ms"]] for tick in known]
+        x = np.hstack([truth["qpos"][rows], truth["qvel"][rows]]) if rows else np.empty((0, 37))
+    return stages(x, [tick["mode"] for tick in known])
+
+
+def _runs(hybrid: list[dict[str, Any]]) -> str:
+    """Modes that ran, with their durations."""
+    runs: list[tuple[int, int]] = []
+    for tick in hybrid:
+        if runs and runs[-1][0] == tick["mode"]:
+            runs[-1] = (runs[-1][0], runs[-1][1] + 1)
+        else:
+            runs.append((tick["mode"], 1))
+    return " | ".join(f"{NAMES[mode]} {0.001 * TICK * n:.2f} s" for mode, n in runs if mode != NONE)
+
+
+def write(path: Path, summary: dict[str, Any]) -> None:
+    """Write it as JSON."""
+    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,36 @@
+"""How late the control steps are, by the robot's clock."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+
+EDGES = (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # ms; the last bin has no end
+_WINDOW = 100  # ticks
+
+
+class Lateness:
+    """Time from when the robot measured a tick's state until its command leaves, beyond the best of late.
+
+    The two clocks differ by an unknown offset that drifts slowly. The smallest difference in the last 2 s is
+    the offset and the shortest way; what a tick takes beyond it is its lateness.
+
+    Attributes:
+        bins: ticks by lateness; EDGES are the bins' upper ends.
+    """
+
+    def __init__(self) -> None:
+        self.bins = [0] * (len(EDGES) + 1)
+        self._recent: deque[float] = deque(maxlen=_WINDOW)
+
+    def add(self, robot: float, now: float) -> float:
+        """A tick of time `robot` on the robot's clock left at `now` on ours [s]; its lateness [ms]."""
+        difference = now - robot
+        self._recent.append(difference)
+        late = 1e3 * (difference - min(self._recent))
+        self.bins[bisect_left(EDGES, late)] += 1
+        return late
+
+    def __len__(self) -> int:
+        """How many ticks."""
+        return sum(self.bins)

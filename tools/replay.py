@@ -1,0 +1,150 @@
+"""Look at a run of the robot again: `python tools/replay.py out/deploy/run.mcap`.
+
+Draws what the log holds, and runs its state frames through the estimator once more: with today's code and
+settings, from the same readings.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+
+from deploy.checks import StateChecks  # noqa: E402
+from deploy.estimator import Estimator  # noqa: E402
+from deploy.log import read  # noqa: E402
+from deploy.modes import NAMES  # noqa: E402
+from deploy.observe import pitch, vertical  # noqa: E402
+from deploy.safety import Phase  # noqa: E402
+from deploy.settings import InputCfg  # noqa: E402
+from hmc.cli import one_line_errors  # noqa: E402
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line.
+
+    Attributes:
+        log: run.mcap of deploy/go2.py.
+        out: figure to write; default: replay.png beside the log.
+    """
+
+    log: tyro.conf.Positional[Path]
+    out: Path | None = None
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A log and what the estimator makes of it.
+
+    Attributes:
+        ticks: control steps, as in the log.
+        again: estimated states by the robot's clock [ms], (37,) each, of the estimator run anew.
+        refused: frames that are not believed.
+    """
+
+    ticks: list[dict[str, Any]]
+    again: dict[int, np.ndarray]
+    refused: int
+
+    def difference(self) -> tuple[float, float]:
+        """Largest difference of height [m] and attitude [rad] between the log's estimate and the new one.
+
+        Both begin anew where the robot stood up, which only the log knows; so only what follows the hybrid
+        phase's begin counts.
+        """
+        rows = [tick for tick in self.ticks if tick["phase"] == Phase.HYBRID and tick["ms"] in self.again]
+        if not rows:
+            return np.nan, np.nan
+        old = np.array([tick["x"] for tick in rows])
+        new = np.array([self.again[tick["ms"]] for tick in rows])
+        height = float(np.abs(old[:, 2] - new[:, 2]).max())
+        turns = [
+            np.arccos(np.clip(vertical(a) @ vertical(b), -1, 1))
+            for a, b in zip(old[:, 3:7], new[:, 3:7], strict=True)
+        ]
+        return height, float(np.max(turns))
+
+
+def replay(path: Path) -> Replay:
+    """Read a log and run its frames through checks and estimator.
+
+    Raises:
+        LogError: not a log of this version.
+    """
+    checks, estimator = StateChecks(InputCfg(max_age=np.inf)), Estimator()
+    ticks: list[dict[str, Any]] = []
+    again: dict[int, np.ndarray] = {}
+    for topic, _, content in read(path):
+        if topic == "tick":
+            # at its end the robot has stood up, and the estimator began anew
+            if (
+                content["phase"] == Phase.STAND
+                and not any(content["variance"])
+                and ticks
+                and any(ticks[-1]["variance"])
+            ):
+                estimator.reset()
+            ticks.append(content)
+        elif topic == "rt/lowstate" and (state := checks.take(content, 0.0)) is not None:
+            t = 0.001 * checks.ms
+            force = state.foot_force.astype(np.float64)
+            found = estimator.update(t, state.gyro, state.acc, state.q, state.dq, state.tau, force)
+            if found is not None:
+                again[checks.ms] = found.x
+    return Replay(ticks, again, sum(checks.counts.values()))
+
+
+def draw(it: Replay, path: Path) -> None:
+    """Phases and modes, pitch and height, speed, targets, lateness."""
+    t = np.array([tick["k"] for tick in it.ticks]) * 0.02
+    x = np.array([tick["x"] for tick in it.ticks])
+    figure, axes = plt.subplots(5, 1, figsize=(10, 12), sharex=True, layout="constrained")
+    axes[0].step(t, [tick["phase"] for tick in it.ticks], where="post")
+    axes[0].set_yticks(list(Phase), [phase.name.lower() for phase in Phase])
+    modes = axes[0].twinx()
+    modes.step(t, [tick["mode"] for tick in it.ticks], where="post", color="C1")
+    modes.set_yticks(range(len(NAMES)), NAMES)
+    axes[1].plot(t, [np.degrees(pitch(vertical(row))) for row in x[:, 3:7]], label="pitch [deg]")
+    axes[1].plot(t, 100 * x[:, 2], label="height [cm]")
+    axes[2].plot(t, x[:, 19:22], label=["vx", "vy", "vz"])
+    axes[2].set_ylabel("velocity, world [m/s]")
+    axes[3].plot(t, [tick["u"] for tick in it.ticks], lw=0.7)
+    axes[3].set_ylabel("joint targets [rad]")
+    axes[4].semilogy(t, np.maximum([tick["late"] for tick in it.ticks], 1e-2), ".", ms=2)
+    axes[4].set_ylabel("lateness [ms]")
+    axes[4].set_xlabel("time [s]")
+    for axis in axes[1:3]:
+        axis.legend()
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def main(args: Args) -> None:
+    """Replay, draw, print."""
+    with one_line_errors():
+        it = replay(args.log)
+        if not it.ticks:
+            raise ValueError(f"log {args.log}: holds no control step")
+    out = args.out or args.log.with_name("replay.png")
+    draw(it, out)
+    height, angle = it.difference()
+    print(
+        f"{len(it.ticks)} control steps, {len(it.again)} states estimated again, {it.refused} frames refused"
+    )
+    print(
+        f"largest difference from the log: height {1e3 * height:.2f} mm, attitude {np.degrees(angle):.3f} deg"
+    )
+    print(out)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
