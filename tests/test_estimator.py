@@ -234,9 +234,11 @@ def test_without_flat_ground_the_height_is_free():
 
 
 @pytest.mark.parametrize(
-    ("motion", "seconds", "speed"), [("footstand", 2.0, 0.03), ("handstand", 2.0, 0.03), ("flip", 3.0, 0.06)]
+    ("motion", "seconds", "speed", "refused"),
+    # a landing foot rolls and creeps: more of its updates are refused (docs/estimator.md)
+    [("footstand", 2.0, 0.03, 0.05), ("handstand", 2.0, 0.03, 0.05), ("flip", 3.0, 0.06, 0.07)],
 )
-def test_short_logs(motion, seconds, speed):
+def test_short_logs(motion, seconds, speed, refused):
     log = simulate(motion, seconds, 7)
     readings = sense(log, 7)
     estimates, _ = play(readings)
@@ -250,7 +252,7 @@ def test_short_logs(motion, seconds, speed):
     assert 0.3 < velocity < 9.0
     assert gravity < 8.0
     assert biases < 18.0
-    assert gates(estimates, log, readings)[0] < 0.05
+    assert gates(estimates, log, readings)[0] < refused
     for e in estimates[::100]:
         if e is not None:
             np.testing.assert_allclose(e.P, e.P.T, rtol=0, atol=1e-15)
