@@ -234,13 +234,18 @@ def test_without_flat_ground_the_height_is_free():
 
 
 @pytest.mark.parametrize(
-    ("motion", "seconds", "speed", "refused"),
-    # a landing foot rolls and creeps: more of its updates are refused (docs/estimator.md)
-    [("footstand", 2.0, 0.03, 0.05), ("handstand", 2.0, 0.03, 0.05), ("flip", 3.0, 0.06, 0.07)],
+    ("motion", "seconds", "speed", "seeds"),
+    # a flip has few updates at its landing: the share that is refused is that of several
+    [("footstand", 2.0, 0.03, [7]), ("handstand", 2.0, 0.03, [7]), ("flip", 3.0, 0.06, [7, 8, 9])],
 )
-def test_short_logs(motion, seconds, speed, refused):
-    log = simulate(motion, seconds, 7)
-    readings = sense(log, 7)
+def test_short_logs(motion, seconds, speed, seeds):
+    assert np.mean([judged(motion, seconds, speed, seed) for seed in seeds]) < 0.05
+
+
+def judged(motion: str, seconds: float, speed: float, seed: int) -> float:
+    """The share of good updates that a log's estimates refused; all else is judged here."""
+    log = simulate(motion, seconds, seed)
+    readings = sense(log, seed)
     estimates, _ = play(readings)
     late = log.t[readings.row] > 1.0
     out, true = outputs(estimates)[late], truth(log, readings.row)[late]
@@ -252,11 +257,11 @@ def test_short_logs(motion, seconds, speed, refused):
     assert 0.3 < velocity < 9.0
     assert gravity < 8.0
     assert biases < 18.0
-    assert gates(estimates, log, readings)[0] < refused
     for e in estimates[::100]:
         if e is not None:
             np.testing.assert_allclose(e.P, e.P.T, rtol=0, atol=1e-15)
             assert np.linalg.eigvalsh(e.P).min() > 0
+    return gates(estimates, log, readings)[0]
 
 
 def test_a_tick_is_fast():

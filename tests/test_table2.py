@@ -90,7 +90,9 @@ def test_tuning_costs_are_those_of_a_run(cfg):
 
         control = chosen(task.modes, choose)
         assert run(control, task.cost, cfg.flip, 7).cost == pytest.approx(cost, rel=1e-9)
-    assert tune(cfg, rules) == rules[int(costs.argmin())]
+    best, cost = tune(cfg, rules)
+    assert best == rules[int(costs.argmin())]
+    assert cost == pytest.approx(float(costs.min()))
 
 
 def test_bad_settings():

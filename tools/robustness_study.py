@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -119,8 +120,8 @@ def conditions_of(cfg: RobustnessCfg, job: Job) -> Conditions:
         return replace(MODEL, push=job.value)
     if job.factor == "noise":
         return replace(MODEL, noise=cfg.conditions.noise.scaled(job.value))
-    one = job.value if job.factor in ("com", "zeros") else (job.value, job.value)
-    return replace(MODEL, variants=VariantsCfg(**{job.factor: one}))  # type: ignore[arg-type]
+    one: Any = job.value if job.factor in ("com", "zeros") else (job.value, job.value)
+    return replace(MODEL, variants=VariantsCfg(**{job.factor: one}))
 
 
 def pushes_of(cfg: RobustnessCfg, job: Job) -> dict[int, tuple[float, float]]:

@@ -51,8 +51,8 @@ def tuned(cfg: Table2Cfg, path: Path, console: Console) -> dict[str, Rule]:
     found = {"untuned": Rule(0, cfg.untuned)}
     for name, rules in (("sequence", sequences(cfg)), ("pitch", switches(cfg))):
         with console.status(f"tuning: {CONTROLLERS[name]}, {len(rules)} rules"):
-            found[name] = tune(cfg, rules)
-        console.print(f"{CONTROLLERS[name]}: {found[name]}", highlight=False)
+            found[name], cost = tune(cfg, rules)
+        console.print(f"{CONTROLLERS[name]}: {found[name]}, mean cost {cost:.2f}", highlight=False)
     study.write_json(path, {name: asdict(rule) for name, rule in found.items()})
     return found
 

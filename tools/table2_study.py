@@ -127,13 +127,15 @@ def executed_costs(task: Task, cfg: RunCfg, rules: Sequence[Rule], seed: int) ->
     return cost
 
 
-def tune(cfg: Table2Cfg, rules: Sequence[Rule]) -> Rule:
-    """The rule with the lowest mean cost over the tuning seeds."""
+def tune(cfg: Table2Cfg, rules: Sequence[Rule]) -> tuple[Rule, float]:
+    """The rule with the lowest mean cost over the tuning seeds, and that cost."""
     costs = [
         executed_costs(flip_task(cfg.flip.task, seed=seed), cfg.flip, rules, seed)
         for seed in cfg.tuning_seeds
     ]
-    return rules[int(torch.stack(costs).mean(0).argmin())]
+    mean = torch.stack(costs).mean(0)
+    best = int(mean.argmin())
+    return rules[best], float(mean[best])
 
 
 def sequences(cfg: Table2Cfg) -> list[Rule]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import mujoco
 import torch
@@ -106,7 +107,7 @@ def draw(cfg: VariantsCfg, n: int, generator: torch.Generator) -> list[Variant]:
 def _one(cfg: VariantsCfg, share: Tensor) -> Variant:
     """The robot at these shares (21,) of the ranges."""
     sides = (2 * share - 1).tolist()
-    values: dict[str, float | tuple[float, ...]] = {}
+    values: dict[str, Any] = {}
     for i, name in enumerate(
         field.name for field in fields(VariantsCfg) if field.name not in ("com", "zeros")
     ):
@@ -114,4 +115,4 @@ def _one(cfg: VariantsCfg, share: Tensor) -> Variant:
         values[name] = low + (high - low) * float(share[i])
     values["com"] = tuple(cfg.com * side for side in sides[6:9])
     values["zeros"] = tuple(cfg.zeros * side for side in sides[9:21])
-    return Variant(**values)  # type: ignore[arg-type]
+    return Variant(**values)

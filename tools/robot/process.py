@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,8 +68,10 @@ class Log:
         if self._path is not None and self._steps:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             columns = zip(*self._steps, strict=True)
-            arrays = {name: np.array(column) for name, column in zip(Truth._fields, columns, strict=True)}
-            np.savez_compressed(self._path, **arrays)  # type: ignore[arg-type]
+            arrays: dict[str, Any] = {
+                name: np.array(column) for name, column in zip(Truth._fields, columns, strict=True)
+            }
+            np.savez_compressed(self._path, **arrays)
 
 
 def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
