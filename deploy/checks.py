@@ -8,8 +8,8 @@ from collections import Counter
 import numpy as np
 
 from deploy.codec import FrameError, RobotState, decode_state
-from deploy.policy import LOWER, UPPER
 from deploy.settings import InputCfg
+from hmc.go2.network import LOWER, UPPER
 
 _WRAP = 2**32
 _RESTART = 1000  # ms that the robot's clock may seem to go back before the robot has restarted

@@ -14,13 +14,13 @@ from deploy.estimate import Estimate
 from deploy.estimator import Estimator
 from deploy.modes import NAMES, NONE, Performer
 from deploy.observe import vertical
-from deploy.policy import Policy
 from deploy.remote import unpack
 from deploy.safety import Body, Envelope, Inputs, Machine, Phase, limited
 from deploy.settings import DeployCfg, EnvelopeCfg, RampCfg
 from deploy.slots import STATE
 from deploy.so3 import Array
 from hmc.go2 import facts
+from hmc.go2.network import Network
 
 TICK = round(1000 * facts.DT)  # ms
 _ZERO = np.zeros(JOINTS)
@@ -54,7 +54,7 @@ class Control:
         policies: of the modes that are policies, by their index.
     """
 
-    def __init__(self, cfg: DeployCfg, policies: Mapping[int, Policy]):
+    def __init__(self, cfg: DeployCfg, policies: Mapping[int, Network]):
         self.cfg = cfg
         self.machine, self.performer = Machine(), Performer(cfg.plan, policies)
         self.checks, self.estimator = StateChecks(cfg.input), Estimator()

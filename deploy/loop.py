@@ -23,13 +23,13 @@ from deploy.messages import LowCmd_, LowState_
 from deploy.modes import FOOT, HAND, NAMES, Plan
 from deploy.motion_switcher import MotionSwitcher, MotionSwitcherError
 from deploy.observe import pitch
-from deploy.policy import Policy
 from deploy.process import ROOT, Job, real_time, told, until_told
 from deploy.safety import Phase
 from deploy.settings import DeployCfg, InputCfg
 from deploy.slots import Board, said, text
 from deploy.timing import Lateness
 from hmc.cfg import load
+from hmc.go2.network import Network
 
 PRIORITY = 50
 WAIT = 0.005  # s for a frame
@@ -239,11 +239,11 @@ class Loop:
         )
 
 
-def policies(foot: str, hand: str) -> dict[int, Policy]:
+def policies(foot: str, hand: str) -> dict[int, Network]:
     """The policies of the modes that have one; ValueError if a file is not for this robot."""
     given = {FOOT: foot, HAND: hand}
     own = {mode: ROOT / "hmc" / "go2" / "policies" / f"{NAMES[mode]}stand.onnx" for mode in given}
-    return {mode: Policy(Path(path) if path else own[mode]) for mode, path in given.items()}
+    return {mode: Network(Path(path) if path else own[mode]) for mode, path in given.items()}
 
 
 def run(job: Job, stopped: Callable[[], bool]) -> None:

@@ -10,9 +10,9 @@ from typing import Self
 import numpy as np
 
 from deploy.observe import anchor_of
-from deploy.policy import Policy
 from deploy.settings import PlanCfg
 from deploy.so3 import Array
+from hmc.go2.network import Network
 
 NAMES = ("foot", "jump", "hand")  # the modes of hmc.go2.task.flip_task, in its order
 FOOT, JUMP, HAND = range(3)
@@ -76,7 +76,7 @@ class Performer:
         policies: of the modes that are policies.
     """
 
-    def __init__(self, cfg: PlanCfg, policies: Mapping[int, Policy]):
+    def __init__(self, cfg: PlanCfg, policies: Mapping[int, Network]):
         self.cfg = cfg
         self.mode, self.entered = NONE, 0
         self.anchor: Array = np.array([0.0, 0.0, 1.0, 0.0])
@@ -108,7 +108,7 @@ class Performer:
         if mode == JUMP:
             assert self.plan is not None
             return self.plan.u[k - self.plan.begin]
-        return self._policies[mode].act(x, u, self.anchor)
+        return self._policies[mode].act(x[None], u[None], self.anchor[None])[0]
 
     def take_over(self, k: int) -> None:
         """Make the plan that has come the one that runs, if its time has come by tick k."""

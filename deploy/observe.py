@@ -1,4 +1,4 @@
-"""The observation of `hmc.go2.observe` for one robot in numpy: same numbers, without torch."""
+"""One robot's attitude in numpy, as `hmc.go2.observe` has it in torch."""
 
 from __future__ import annotations
 
@@ -7,22 +7,6 @@ import math
 import numpy as np
 
 from deploy.so3 import Array, matrix
-
-
-def observe(x: Array, u: Array, anchor: Array) -> Array:
-    """Observation of a policy, (48,); its layout is that of `hmc.go2.observe.observe`.
-
-    Args:
-        x: state (37,): qpos (position, quaternion w x y z, joints), qvel (linear velocity in the world
-            frame, angular velocity in the body frame, joints).
-        u: previous action: joint targets [rad], (12,).
-        anchor: where the mode was entered, (4,), see `anchor_of`.
-    """
-    C = matrix(x[3:7])
-    dx, dy = x[0] - anchor[0], x[1] - anchor[1]
-    c, s = anchor[2], anchor[3]
-    position = (c * dx + s * dy, c * dy - s * dx, x[2])
-    return np.concatenate([-C[2], position, x[19:22] @ C, x[22:25], x[7:19], x[25:37], u])
 
 
 def anchor_of(x: Array) -> Array:

@@ -21,6 +21,7 @@ from hmc.cfg import load
 from hmc.go2.model import DT
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import FlipCfg, flip_task
+from hmc.planner import worlds_for
 from hmc.receding import SearchCfg
 from hmc.start import Start
 
@@ -37,9 +38,11 @@ class PlannerCfg:
             looked for.
         first: effort of a plan then: the robot stands and can wait.
         search: effort of every other plan.
+        mpc: whether the jump is planned by sampling MPC inside the plans; else its guess is played as it is.
     """
 
     lead: int = 45
+    mpc: bool = False
     first: SearchCfg = field(default_factory=SearchCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
 
@@ -88,6 +91,7 @@ class Planner:
         threads: int = 0,
         speed: float = 1.0,
     ):
+        task = replace(task, jump=replace(task.jump, mpc=cfg.mpc))
         self._horizon, self._tick = task.horizon, DT / speed
         if not cfg.lead < self._horizon <= STEPS:
             raise ValueError(
@@ -102,7 +106,9 @@ class Planner:
         self.seconds: deque[float] = deque([0.1] * 5, maxlen=30)
         self._cfg, self._rules, self._seed = cfg, rules, seed
         searches = (cfg.first, cfg.search)
-        self._sim = self.task.make_sim(1 + max(max(it.samples, it.pairs + it.moves) for it in searches))
+        self._sim = self.task.make_sim(
+            max(worlds_for(self.task, it.samples, 0, it.pairs + it.moves) for it in searches)
+        )
         self._one = self.task.make_sim(1)
         self._shipped: dict[int, Shipped] = {}
         self._number = 0

@@ -24,11 +24,11 @@ from enum import IntEnum
 import numpy as np
 
 from deploy.observe import lean, pitch
-from deploy.policy import LOWER, UPPER
 from deploy.remote import Button
 from deploy.settings import EnvelopeCfg
 from deploy.so3 import Array
 from hmc.go2 import facts
+from hmc.go2.network import LOWER, UPPER
 
 NOTHING, EMERGENCY = Button(0), Button.L2 | Button.B
 PEAK_TORQUE = facts.PEAK * np.array(facts.GEAR)

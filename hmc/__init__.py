@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from hmc.evaluate import Evaluator as Evaluator
     from hmc.modes import Mode as Mode
     from hmc.modes import ModeSet as ModeSet
+    from hmc.modes import Motion as Motion
     from hmc.planner import Plan as Plan
     from hmc.planner import PlanInterrupted as PlanInterrupted
     from hmc.planner import plan as plan
@@ -37,6 +38,7 @@ _HOME = {
     "Evaluator": "hmc.evaluate",
     "Mode": "hmc.modes",
     "ModeSet": "hmc.modes",
+    "Motion": "hmc.modes",
     "Plan": "hmc.planner",
     "PlanInterrupted": "hmc.planner",
     "plan": "hmc.planner",

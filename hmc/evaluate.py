@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -52,6 +53,7 @@ class Evaluator:
         if known is not None and known.meets(self._trunk):
             self._trunk = known
         self._next: Schedule | None = None  # to be recorded with the next batch
+        self._traces: dict[bytes, Callable[[], Trace]] = {}  # of the last batch, where they were kept
         self._table = Table(len(task.modes), len(task.cost.names))
 
     @property
@@ -118,6 +120,7 @@ class Evaluator:
             if rolled.trace is not None:
                 self._trunk, self._next = rolled.trace, None
             self._learn(fresh[chunk], rolled)
+            self._keep(fresh[chunk], rolled)
             first += size
         return torch.from_numpy(self._table.costs(self._table.find(keys), bound))
 
@@ -143,8 +146,8 @@ class Evaluator:
     def follow(self, schedule: Schedule) -> float:
         """Cost of a schedule, so that others are rolled out from where they part from it.
 
-        A schedule whose cost is known is recorded together with the next batch, which costs the same number
-        of control steps and less time.
+        A schedule of the last batch was recorded with it, if that was small. Another one whose cost is known
+        is recorded together with the next batch, which costs as many control steps as alone and less time.
         """
         rows = schedule.tensor()[None]
         key = self._table.keys(rows)
@@ -152,12 +155,15 @@ class Evaluator:
         known = not bool(self._table.missing(found, math.inf)[0])
         if known:
             cost = float(self._table.costs(found, math.inf)[0])
+            if math.isfinite(cost) and key[0] in self._traces:
+                self._trunk = self._traces[key[0]]()
             self._next = schedule if math.isfinite(cost) and schedule.modes != self._trunk.modes else None
             return cost
         if found[0] < 0 and not self._allowed(key, torch.tensor([0]), rows)[0]:
             return math.inf
         self._next = schedule
         self.record()
+        self._traces = {}
         trunk = self._trunk
         self.rollouts += 1
         self.ruled_out += trunk.barred
@@ -208,6 +214,11 @@ class Evaluator:
         self._table.learn(out, np.full(len(out), math.inf), np.zeros(len(out), dtype=bool), nothing)
         self.ruled_out += int(broken.sum())
         return [key for key, bad in zip(keys, broken.tolist(), strict=True) if not bad], rows[~broken]
+
+    def _keep(self, keys: list[bytes], rolled: Rolled) -> None:
+        """How to come by the traces of schedules just rolled out."""
+        traces = rolled.traces
+        self._traces = {} if traces is None else {key: partial(traces, i) for i, key in enumerate(keys)}
 
     def _learn(self, keys: list[bytes], rolled: Rolled) -> None:
         self.rollouts += len(keys)

@@ -49,6 +49,30 @@ class Mode(ABC):
         """
 
 
+class Motion(Mode):
+    """Plays inputs, one a control step since entry, and then holds the last one.
+
+    Memory: the number of steps taken since entry.
+
+    Args:
+        name: of the mode.
+        inputs: what it plays, (G, nu).
+    """
+
+    memory_size = 1
+
+    def __init__(self, name: str, inputs: Tensor):
+        if inputs.ndim != 2 or len(inputs) == 0 or not bool(inputs.isfinite().all()):
+            raise ValueError(
+                f"mode {name!r}: a motion is (G, nu) finite inputs, G >= 1, got shape {tuple(inputs.shape)}"
+            )
+        self.name, self.inputs = name, inputs
+
+    def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        step = memory[:, 0].long().clamp(max=len(self.inputs) - 1)
+        return self.inputs.to(x)[step], memory + 1
+
+
 class ModeSet:
     """An ordered set of modes; a schedule refers to them by index."""
 

@@ -20,11 +20,12 @@ def handovers(space: SwitchSpace, k: int, position: int, n: int) -> list[tuple[S
         position: where in the order of `tails` to begin.
         n: of them.
     """
-    order = tails(space, k, position)
-    first = next((tail for tail in order if tail.duration > 1), None)
+    first = next((tail for tail in tails(space, k, position) if tail.duration > 1), None)
     if first is None:
         return []
-    later = (tail for tail in order if tail.start > first.start and tail.mode != first.mode)
+    later = (
+        tail for tail in tails(space, k, position) if tail.start > first.start and tail.mode != first.mode
+    )
     return [(first, tail) for tail, _ in zip(later, range(n), strict=False)]
 
 

@@ -266,7 +266,8 @@ def plan(
 
 def worlds_for(task: Task, samples: int, max_samples: int, beside: int) -> int:
     """Worlds that a batch fits into, with one more for the schedule that is recorded beside it."""
-    return min(max(samples, max_samples, beside), len(SwitchSpace(len(task.modes), task.horizon))) + 1
+    single = min(max(samples, max_samples), len(SwitchSpace(len(task.modes), task.horizon)))
+    return single + beside + 1
 
 
 def _incumbent(

@@ -13,7 +13,10 @@ from hmc.branches import Branches, branches
 from hmc.cost import total
 from hmc.sim.ids import Ids, count
 from hmc.trace import Recorder, Trace
-from hmc.worlds import Worlds, finite, stage_terms
+from hmc.worlds import Crew, Worlds, finite
+
+ROWS, STEPS = 256, 8
+RECORDED = 64  # branches that are all recorded, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,7 @@ class Rolled:
         pruned: worlds given up because they are sure to exceed the bound, (n,) bool.
         barred: worlds that came to a mode whose guard barred it, (n,) bool; their cost is inf.
         trace: of the schedule that was to be recorded.
+        traces: row -> its trace, of every one that was not given up; None where they are too many to keep.
     """
 
     cost: Tensor
@@ -35,6 +39,7 @@ class Rolled:
     pruned: Tensor
     barred: Tensor
     trace: Trace | None = None
+    traces: Callable[[int], Trace] | None = None
 
 
 def roll(
@@ -65,13 +70,13 @@ def roll(
     if recorded is not None:
         rows = torch.cat([torch.tensor([recorded], dtype=rows.dtype), rows])
     tree = branches(rows, trunk.modes[: len(trunk)])
-    recorder = None if recorded is None else Recorder(trunk, recorded, tree.path(0))
-    rollout = _Rollout(worlds, trunk, tree, bound, recorder)
-    for i in range(rows.shape[1] + 1):
+    rollout = _Rollout(worlds, trunk, tree, bound, recorded is not None)
+    first = next((i for i, born in enumerate(tree.born[1:]) if born > 0), rows.shape[1])
+    for i in range(first, rows.shape[1] + 1):
         if stop is not None and stop():
             return None
         rollout.advance(i)
-    return rollout.rolled(tree.row.argsort()[len(rows) - len(schedules) :])
+    return rollout.rolled(len(rows) - len(schedules))
 
 
 @torch.no_grad()
@@ -91,87 +96,101 @@ def record(worlds: Worlds, known: Trace, schedule: Sequence[int]) -> Trace:
 
 
 class _Rollout:
-    """A tree of n branches being rolled out, branch j in world j; arguments as of `roll`."""
+    """A tree of n branches being rolled out, branch j in world j; arguments as of `roll`.
 
-    def __init__(self, worlds: Worlds, trunk: Trace, tree: Branches, bound: float, recorder: Recorder | None):
+    What steps cost is found out for several of them at a time: a call for few worlds takes as long as one
+    for many. `watched` says whether row 0 is to be recorded whatever the bound.
+    """
+
+    def __init__(self, worlds: Worlds, trunk: Trace, tree: Branches, bound: float, watched: bool):
         task, device, n = worlds.task, worlds.sim.device, len(tree.row)
         self.worlds, self.sim, self.task, self.trunk, self.tree = worlds, worlds.sim, task, trunk, tree
-        self.recorder = recorder
         self.modes, self.parents = tree.modes.to(device), tree.parent.to(device)
         self.horizon, self.stages = tree.modes.shape[1], len(task.cost.stage)
         self.limit = bound if task.cost.nonnegative else math.inf
         self.slack = 1e-9 * abs(self.limit)  # more than rounding can make of partial cost and lower bound
         self.limits = torch.full((n,), self.limit, dtype=torch.float64, device=device)
-        if recorder is not None:
-            self.limits[recorder.branches] = math.inf
+        self.path = tree.path(0) if watched else []
+        self.limits[[branch for branch in set(self.path) if branch >= 0]] = math.inf
+        self.recorder = (
+            Recorder(trunk, None if n <= RECORDED else self.path) if watched or n <= RECORDED else None
+        )
         self.terms = torch.zeros(len(task.cost.names), n, dtype=torch.float64, device=device)
         self.result = torch.full((n,), math.inf, dtype=torch.float64, device=device)
         self.going, self.pruned, self.barred = torch.zeros(3, n, dtype=torch.bool, device=device)
         self.ids: Tensor | slice = slice(0, 0)  # branches that go on; a slice while none has ended
+        self.crew: Crew | None = None  # who acts in them; None: to be found out
+        self.changes = [True, *(tree.modes[:, 1:] != tree.modes[:, :-1]).any(0).tolist()]
+        self.unpriced: list[tuple[Tensor, Tensor, Tensor]] = []  # x, u, u before of the last steps
+        # what cannot end a world on the way is looked at now and then only
+        watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
+        self.at_once = 1 if watchful else STEPS
 
     def advance(self, i: int) -> None:
         """Step i of all branches that go on: what is born then, and their end at i = T, included."""
         task, sim, k = self.task, self.sim, self.trunk.k + i
-        self._grow(i)
-        watched = -1 if self.recorder is None else self.recorder.path[i]
-        if self.recorder is not None and watched >= 0 and bool(self.going[watched]):
-            self.recorder.arrive(self.worlds, i, watched)
-        x = sim.x(self._at)
+        if i == self.horizon or self.tree.born[i + 1] > self.tree.born[i]:
+            self._price(k)
+            self._grow(i)
+        if count(self.ids, sim.num_worlds) == 0:
+            return
+        x, u_prev = sim.x(self._at), sim.u(self._at)
+        if self.recorder is not None:
+            self.recorder.arrive(self.worlds, i, self.ids, x, u_prev)
         if not math.isfinite(float(x.sum())):  # a finite sum has finite parts
-            (x,) = self._drop(~finite(x), x)
+            x, u_prev = self._price(k, x, u_prev)
+            x, u_prev = self._drop(~finite(x), x, u_prev)
         if len(x) > 0 and i == self.horizon:
             terminal = task.cost.terminal_terms(x, torch.full((len(x),), k, device=sim.device))
             self.terms[self.stages :, self.ids] = terminal.to(torch.float64).T
             self.result[self.ids] = total(self.terms[:, self.ids].T)
             return
         if len(x) > 0:
-            x = self._give_up(i, x, k)
+            x, u_prev = self._give_up(i, x, u_prev)
         if len(x) == 0:
             return
-        u_prev = sim.u(self._at)
-        u = self.worlds.act(self.ids, self._modes(i), x, u_prev, k)
-        stage = stage_terms(task, x, u, u_prev, k, sim.dt).T
-        self.terms[: self.stages, self.ids] += stage
-        partial = total(self.terms[:, self.ids].T)
-        if self.recorder is not None and watched >= 0 and bool(self.going[watched]):
-            place = watched if isinstance(self.ids, slice) else int((self.ids == watched).nonzero())
-            if bool((partial[place] + u[place].sum()).isfinite()):
-                self.recorder.step(stage[:, place].clone())
-        if not math.isfinite(float(partial.sum() + u.sum())) or self._beyond(partial).any():
-            (u,) = self._prune(partial, finite(u), u)
+        if self.crew is None or self.changes[i]:
+            self.crew = self.worlds.crew(self.ids, self.modes[self.ids, i].long())
+        u = self.worlds.act(self.crew, x, u_prev, k)
+        self.unpriced.append((x, u, u_prev))
+        sane = None if math.isfinite(float(u.sum())) else finite(u)
+        if sane is not None or len(self.unpriced) >= min(self.at_once, ROWS // len(u)):
+            (u,) = self._price(k + 1, u, sane=sane)
         if len(u) > 0:
             sim.step(u, self._at)
             self.worlds.own_steps += len(u)
 
-    def rolled(self, rows: Tensor) -> Rolled:
-        """What came of branches `rows`."""
+    def rolled(self, first: int) -> Rolled:
+        """What came of the schedules from row `first` on; of row 0 the trace, if it was watched."""
         self.result[self.result.isnan()] = math.inf
         ended = ~self.result.isfinite()
         diverged = ended & ~self.pruned & ~self.barred
-        if self.recorder is not None:
-            last = self.recorder.path[-1]
-            if bool(self.going[last]):
-                self.recorder.end(self.terms[self.stages :, last].clone())
-            if bool(self.barred[last]):
-                self.recorder.bar()
+        terminal, going, barred = self.terms[self.stages :].clone(), self.going.tolist(), self.barred.tolist()
         self.terms[:, ended | self.pruned] = math.nan
-        rows = rows.to(self.sim.device)
+        recorder, tree = self.recorder, self.tree
+
+        def trace(row: int) -> Trace:
+            assert recorder is not None
+            path = tree.path(row)
+            last = path[-1]
+            modes = tuple(tree.modes[last].tolist())
+            return recorder.trace(modes, path, terminal[:, last] if going[last] else None, barred[last])
+
+        at = tree.row.argsort()[first:].to(self.sim.device)
         return Rolled(
-            self.result[rows],
-            self.terms[:, rows].T,
-            diverged[rows],
-            self.pruned[rows],
-            self.barred[rows],
-            None if self.recorder is None else self.recorder.trace(),
+            self.result[at],
+            self.terms[:, at].T,
+            diverged[at],
+            self.pruned[at],
+            self.barred[at],
+            trace(0) if self.path else None,
+            None if recorder is None or recorder.path is not None else lambda row: trace(first + row),
         )
 
     @property
     def _at(self) -> Ids:
         """The worlds of `ids`; None, which costs least, where they are all."""
         return None if count(self.ids, self.sim.num_worlds) == self.sim.num_worlds else self.ids
-
-    def _modes(self, i: int) -> Tensor:
-        return self.modes[self.ids, i].long()
 
     def _grow(self, i: int) -> None:
         """Branches that are born at step i become copies of what they part from."""
@@ -186,7 +205,7 @@ class _Rollout:
         if now > seeds:
             self.worlds.branch(stems, shoots)
             self.terms[:, shoots] = self.terms[:, stems]
-        self.going[old:now] = True
+        self.going[old:now], self.crew = True, None
         if isinstance(self.ids, slice):
             self.ids = slice(0, now)
             return
@@ -194,14 +213,37 @@ class _Rollout:
             each[shoots] = each[stems]
         self.ids = self.going[:now].nonzero().squeeze(1)
 
-    def _give_up(self, i: int, x: Tensor, k: int) -> Tensor:
-        """End what a guard bars and what is sure to exceed its limit; the states of the others."""
-        rules, rest = self.task.rules, self.task.lower_bound
+    def _price(self, k: int, *rows: Tensor, sane: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Add what the last steps cost, the last one that before control step k, and end what is beyond its
+        limit, no number, or not `sane`; of `rows`, (n, ...) each, those of the others."""
+        if not self.unpriced:
+            return rows
+        steps, n = len(self.unpriced), len(self.unpriced[0][0])
+        x, u, u_prev = self.unpriced[0] if steps == 1 else map(torch.cat, zip(*self.unpriced, strict=True))
+        self.unpriced = []
+        ks = torch.arange(k - steps, k, device=x.device).repeat_interleave(n)
+        terms = self.task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64) * self.sim.dt
+        stage = terms.T.reshape(self.stages, steps, n)
+        sums = self.terms[: self.stages, self.ids]
+        for i, step in enumerate(stage.unbind(1), k - steps - self.trunk.k):
+            sums = sums + step
+            if self.recorder is not None:
+                self.recorder.step(i, self.ids, step)
+        self.terms[: self.stages, self.ids] = sums
+        partial = total(self.terms[:, self.ids].T)
+        if sane is not None or not math.isfinite(float(partial.sum())) or self._beyond(partial).any():
+            everywhere = torch.ones_like(partial, dtype=torch.bool)
+            return self._prune(partial, everywhere if sane is None else sane, *rows)
+        return rows
+
+    def _give_up(self, i: int, x: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+        """End what a guard bars and what is sure to exceed its limit; states and inputs of the others."""
+        rules, rest, k = self.task.rules, self.task.lower_bound, self.trunk.k + i
         if rules is not None and rules.guards:
-            bad = self.worlds.barred(self.ids, self._modes(i), x, k)
+            bad = self.worlds.barred(self.ids, self.modes[self.ids, i].long(), x, k)
             if bool(bad.any()):
                 self.barred[self._indices[bad]] = True
-                (x,) = self._drop(bad, x)
+                x, u = self._drop(bad, x, u)
         if rest is not None and self.limit < math.inf and len(x) > 0:
             steps = torch.full((len(x),), k, device=x.device)
             least = total(self.terms[:, self.ids].T) - self.slack
@@ -209,8 +251,8 @@ class _Rollout:
             # hopeless is pruned as well, and a bound that is no number bounds nothing
             least = least.nan_to_num(nan=0.0)
             if self._beyond(least).any():
-                (x,) = self._prune(least, torch.ones_like(least, dtype=torch.bool), x)
-        return x
+                x, u = self._prune(least, torch.ones_like(least, dtype=torch.bool), x, u)
+        return x, u
 
     def _beyond(self, cost: Tensor) -> Tensor:
         """Whose cost so far is too much already, (n,) bool."""
@@ -231,6 +273,6 @@ class _Rollout:
         """End those of `ids` that are `bad` (n,); of `rows`, (n, ...) each, those of the others."""
         if bool(bad.any()):
             index = self._indices
-            self.going[index[bad]] = False
+            self.going[index[bad]], self.crew = False, None
             self.ids, rows = index[~bad], tuple(each[~bad] for each in rows)
         return rows

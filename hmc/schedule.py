@@ -6,7 +6,7 @@ import math
 import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, islice
 from typing import overload
 
 import numpy as np
@@ -205,7 +205,7 @@ class Draws:
         return torch.tensor(drawn, dtype=torch.long)
 
 
-def tails(space: SwitchSpace, k: int, position: int) -> list[Switch]:
+def tails(space: SwitchSpace, k: int, position: int) -> Iterator[Switch]:
     """The switches that last to the end of the horizon, once each, spread evenly over modes and moments.
 
     They follow an additive recurrence with a step near the golden section. A moment keeps its place in it
@@ -218,9 +218,10 @@ def tails(space: SwitchSpace, k: int, position: int) -> list[Switch]:
     """
     size, horizon = space.num_modes * space.horizon, space.horizon
     step = next(s for s in range(max(1, round(0.618 * size)), 2 * size) if math.gcd(s, size) == 1)
-    slots = (position + np.arange(size)) * step % size
-    modes, starts = slots // horizon, (slots % horizon - k) % horizon
-    return [Switch(m, mu, horizon - mu) for m, mu in zip(modes.tolist(), starts.tolist(), strict=True)]
+    for i in range(position, position + size):
+        mode, moment = divmod(i * step % size, horizon)
+        start = (moment - k) % horizon
+        yield Switch(mode, start, horizon - start)
 
 
 class TailsFirst:
@@ -240,16 +241,16 @@ class TailsFirst:
 
     def __init__(self, space: SwitchSpace, rng: np.random.Generator, k: int = 0, position: int = 0):
         self._space = space
-        self._tails = np.array([space.index(tail) for tail in tails(space, k, position)])
+        self._tails = (space.index(tail) for tail in tails(space, k, position))
         self._rest = Draws(len(space), rng)
         self.left = len(space)
 
     def take(self, n: int) -> Tensor:
         """The next n indices, or all that are left if fewer, (n,) long."""
         n = min(n, self.left)
-        head, self._tails = self._tails[:n], self._tails[n:]
+        head = list(islice(self._tails, n))
         self.left -= n
-        parts = [torch.from_numpy(head)]
+        parts = [torch.tensor(head, dtype=torch.long)]
         missing = n - len(head)
         while missing > 0:
             drawn = self._rest.take(missing)

@@ -15,6 +15,8 @@ from hmc.moves import handovers, moves
 from hmc.robust import AnyEvaluator
 from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
 
+Pairs = list[tuple[Switch, ...]]
+
 
 @dataclass
 class Search:
@@ -73,25 +75,37 @@ class Search:
         """Whether there is something to accept."""
         return self._found is not None
 
-    def batches(self, order: Draws | TailsFirst | InOrder) -> Iterator[tuple[Tensor, Tensor]]:
-        """Switches of Omega in an order, batch by batch: indices and costs, (n,) each; inf if not known."""
+    def batches(
+        self, order: Draws | TailsFirst | InOrder, beside: bool = False
+    ) -> Iterator[tuple[Tensor, Tensor, Pairs, Tensor]]:
+        """Switches of Omega in an order, batch by batch: indices and costs, (n,) each; inf if not known.
+
+        With `beside`, also what takes two switches, of which the first alone need not improve, and the costs
+        of that: see `hmc.moves`. All of it is rolled out together, which takes least time.
+        """
         waiting, size = torch.empty(0, dtype=torch.long), self.samples
         self.evaluator.follow(self.schedule)
         while order.left > 0 or len(waiting) > 0:
             waiting = torch.cat([waiting, order.take(size - len(waiting))])
             room, limit = self.meter.room(len(waiting))
-            schedules = self.space.stitch(self.schedule, waiting[:room])
-            if room > 0 and (n := self.meter.affordable(schedules)) < room:
+            pairs = self._pairs(room) if beside else []
+            schedules = [self.space.stitch(self.schedule, waiting[:room])]
+            schedules += [self._stitched(switches).tensor()[None] for switches in pairs]
+            batch = torch.cat(schedules)
+            affordable = self.meter.affordable(batch)
+            if 0 <= affordable < room:
                 # few rollouts take as long as many: what is left over is not worth another round
-                room, limit = n if 4 * n >= self._largest else 0, "control_steps"
+                room, limit = affordable if 4 * affordable >= self._largest else 0, "control_steps"
             if room <= 0:
                 self.stopped_by = limit
                 return
             indices, waiting, self._largest = waiting[:room], waiting[room:], max(self._largest, room)
-            costs = self._roll(schedules[:room])
+            pairs = pairs[: max(0, affordable - room)]
+            costs = self._roll(batch[: room + len(pairs)])
             known = ~costs.isnan()
-            self.seen += int(known.sum())
-            yield indices, torch.where(known, costs, math.inf)
+            self.seen += int(known[:room].sum())
+            found = torch.where(known, costs, math.inf)
+            yield indices, found[:room], pairs, found[room:]
             if self.stopped_by or not known.all():
                 self.stopped_by = self.stopped_by or "seconds"
                 return
@@ -103,19 +117,12 @@ class Search:
         if cost < self.bound:
             self._found = tuple(switches), cost
 
-    def look_past(self) -> None:
-        """Try what takes two switches, of which the first alone need not improve: see `hmc.moves`."""
+    def _pairs(self, ahead: int) -> Pairs:
+        """What is tried beside a batch of `ahead` draws."""
         k = self.evaluator.start.k
-        room, _ = self.meter.room(self.pairs + self.moves)
+        room = self.meter.room(ahead + self.pairs + self.moves)[0] - ahead
         tried = handovers(self.space, k, k + len(self.switches), min(self.pairs, room))
-        tried += moves(self.schedule, self.rng, min(self.moves, room - len(tried)))
-        if not tried:
-            return
-        schedules = torch.stack([self._stitched(switches).tensor() for switches in tried])
-        costs = self._roll(schedules[: self.meter.affordable(schedules)])
-        if len(costs) > 0:
-            best = int(costs.nan_to_num(math.inf).argmin())
-            self.offer(tried[best], float(costs[best]))
+        return tried + moves(self.schedule, self.rng, min(self.moves, room - len(tried)))
 
     def _stitched(self, switches: Sequence[Switch]) -> Schedule:
         """The schedule with switches stitched one after the other."""
@@ -154,17 +161,19 @@ def sample(search: Search) -> None:
     The batch's best is taken, not its first: the whole batch has been rolled out by then.
     """
     draws = ORDERS[search.order](search)
-    for indices, costs in search.batches(draws):
+    for indices, costs, pairs, theirs in search.batches(draws, beside=True):
         best = costs.argmin()
         search.offer([search.space[int(indices[best])]], float(costs[best]))
-        search.look_past()
+        if pairs:
+            best = theirs.argmin()
+            search.offer(pairs[int(best)], float(theirs[best]))
         if search.found:
             return
 
 
 def exhaustive(search: Search) -> None:
     """Problem 5 solved exactly: the best of all of Omega; of equal ones, that of lowest index."""
-    for indices, costs in search.batches(InOrder(len(search.space))):
+    for indices, costs, _, _ in search.batches(InOrder(len(search.space))):
         best = costs.argmin()
         search.offer([search.space[int(indices[best])]], float(costs[best]))
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hmc.cost import total
 from hmc.schedule import Schedule
+from hmc.sim.ids import Ids, fresh
 from hmc.start import Start
 from hmc.task import Task
 from hmc.worlds import Worlds
@@ -148,61 +149,90 @@ def root(worlds: Worlds, start: Start) -> Trace:
 
 
 class Recorder:
-    """Takes down the trace of one world of many while they are rolled out.
+    """Takes down what happens to worlds while they are rolled out, for the traces of their schedules.
 
     Args:
         known: the trace of an earlier schedule from the same start.
-        modes: the schedule, T mode indices.
-        path: the world that it is in at each step i = 0 ... T; -1 as long as it agrees with `known`.
+        path: the one world to take down at each step i = 0 ... T, -1 for none; None takes down all.
     """
 
-    def __init__(self, known: Trace, modes: tuple[int, ...], path: list[int]):
-        self.known, self.modes, self.path = known, modes, path
-        self.agree = next(i for i, world in enumerate(path) if world >= 0)
-        self._rows = [tuple(getattr(known, part)[: self.agree + 1] for part in SITUATION)]
-        self._stage = [known.stage[: self.agree]]
-        self._terminal, self._barred = torch.full_like(known.terminal, math.nan), False
+    def __init__(self, known: Trace, path: list[int] | None):
+        self.known, self.path = known, path
+        # by step: which worlds, and what of them
+        self._rows: dict[int, tuple[Ids, tuple[Tensor, ...]]] = {}
+        self._stage: dict[int, tuple[Ids, Tensor]] = {}
 
-    @property
-    def branches(self) -> list[int]:
-        """The worlds that it is in, one after the other."""
-        return list(dict.fromkeys(self.path[self.agree :]))
+    def arrive(self, worlds: Worlds, i: int, ids: Ids, x: Tensor, u: Tensor) -> None:
+        """Worlds `ids` have come to step i, in states x with last inputs u, (n, ...)."""
+        if self.path is not None:
+            place = _place(ids, self.path[i])
+            if place < 0:
+                return
+            ids, x, u = (
+                torch.tensor([self.path[i]], device=x.device),
+                x[place : place + 1],
+                u[place : place + 1],
+            )
+        self._rows[i] = ids, (x, u, *_rest(worlds, ids))
 
-    def arrive(self, worlds: Worlds, i: int, world: int) -> None:
-        """World number `world` has come to step i."""
-        if i > self.agree:  # there it is what `known` says
-            self._rows.append(_situation(worlds, torch.tensor([world], device=worlds.sim.device)))
+    def step(self, i: int, ids: Ids, stage: Tensor) -> None:
+        """Stage terms of worlds `ids` in step i, (number of stage terms, n)."""
+        if self.path is not None:
+            place = _place(ids, self.path[i])
+            if place < 0:
+                return
+            ids, stage = torch.tensor([self.path[i]], device=stage.device), stage[:, place : place + 1]
+        self._stage[i] = ids, stage
 
-    def step(self, stage: Tensor) -> None:
-        """Its stage terms in this step, (number of stage terms,)."""
-        self._stage.append(stage[None])
+    def trace(self, modes: tuple[int, ...], path: list[int], terminal: Tensor | None, barred: bool) -> Trace:
+        """The trace of a schedule.
 
-    def end(self, terminal: Tensor) -> None:
-        """Its terminal terms, (number of terminal terms,)."""
-        self._terminal = terminal
-
-    def bar(self) -> None:
-        """A guard bars its next mode."""
-        self._barred = True
-
-    def trace(self) -> Trace:
-        """What was recorded."""
-        parts = zip(SITUATION, zip(*self._rows, strict=True), strict=True)
-        situation = {part: torch.cat(column) for part, column in parts}
+        Args:
+            modes: of the schedule, T.
+            path: the world that it was in at each step i = 0 ... T; -1 as long as it agrees with `known`.
+            terminal: its terminal terms, (number of terminal terms,); None where it did not come so far.
+            barred: whether a guard barred its next mode.
+        """
         known = self.known
+        agree = next(i for i, world in enumerate(path) if world >= 0)
+        rows, stage = [], []
+        for i in range(agree, len(modes)):
+            ids, found = self._stage.get(i, (None, known.stage))
+            place = -1 if ids is None else _place(ids, path[i])
+            then, situation = self._rows.get(i + 1, (None, ()))
+            after = -1 if then is None else _place(then, path[i] if i + 1 == len(path) else path[i + 1])
+            if min(place, after) < 0 or not math.isfinite(float(found[:, place].sum())):
+                break
+            stage.append(found[None, :, place])
+            rows.append(tuple(part[after : after + 1] for part in situation))
+        before = [tuple(getattr(known, part)[: agree + 1] for part in SITUATION)]
+        parts = zip(SITUATION, zip(*before, *rows, strict=True), strict=True)
+        situation_of: dict[str, Any] = {part: torch.cat(column) for part, column in parts}
         return Trace(
             known.task,
-            self.modes,
+            modes,
             known.k,
-            stage=torch.cat(self._stage),
-            terminal=self._terminal,
+            stage=torch.cat([known.stage[:agree], *stage]),
+            terminal=torch.full_like(known.terminal, math.nan) if terminal is None else terminal,
             ran=known.ran,
-            barred=self._barred,
-            **situation,
+            barred=barred,
+            **situation_of,
         )
 
 
-def _situation(worlds: Worlds, ids: Tensor) -> tuple[Tensor, ...]:
+def _place(ids: Ids, world: int) -> int:
+    """Where in `ids` a world is; -1 where it is not."""
+    if isinstance(ids, Tensor):
+        found = (ids == world).nonzero()
+        return int(found[0]) if len(found) > 0 else -1
+    return world if ids is None or world in range(ids.start or 0, ids.stop) else -1
+
+
+def _rest(worlds: Worlds, ids: Ids) -> tuple[Tensor, ...]:
+    """What `SITUATION` names after x and u, of worlds `ids`."""
+    return fresh(worlds.memory, ids), fresh(worlds.mode, ids), worlds.sim.save(ids)
+
+
+def _situation(worlds: Worlds, ids: Ids) -> tuple[Tensor, ...]:
     """What `SITUATION` names, of worlds `ids`."""
-    sim = worlds.sim
-    return sim.x(ids), sim.u(ids), worlds.memory[ids], worlds.mode[ids], sim.save(ids)
+    return worlds.sim.x(ids), worlds.sim.u(ids), *_rest(worlds, ids)

@@ -1,14 +1,15 @@
-"""Worlds: a simulator together with what its modes remember, and the sums that rollouts keep."""
+"""Worlds: a simulator together with what its modes remember."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from hmc.modes import Mode
 from hmc.sim.base import Sim
-from hmc.sim.ids import Ids, count, fresh, where
+from hmc.sim.ids import Ids, count, where
 from hmc.start import Start
 from hmc.task import Task
 
@@ -27,6 +28,7 @@ class Worlds:
     def __init__(self, task: Task, sim: Sim):
         self.task, self.sim = task, sim
         self.own_steps = self.nested_steps = 0
+        self._all = torch.arange(sim.num_worlds, device=sim.device)
         self.mode = torch.full((sim.num_worlds,), -1, dtype=torch.long, device=sim.device)
         self.memory = torch.zeros(sim.num_worlds, task.modes.memory_size, dtype=sim.dtype, device=sim.device)
 
@@ -63,12 +65,30 @@ class Worlds:
         entered = modes != self.mode[where(ids)]
         return rules.barred(self.task.modes, entered, modes, x, torch.full_like(modes, k))
 
-    def act(self, ids: Ids, modes: Tensor, x: Tensor, u: Tensor, k: int) -> Tensor:
+    def crew(self, ids: Ids, modes: Tensor) -> Crew:
+        """Who acts in worlds `ids` when their modes are `modes` (n,) long: it holds until either changes."""
+        ids, indices = where(ids), modes.unique().tolist()
+        parts = []
+        for index in indices:
+            rows = slice(None) if len(indices) == 1 else (modes == index).nonzero().squeeze(1)
+            at = (
+                ids
+                if isinstance(rows, slice)
+                else rows + (ids.start or 0)
+                if isinstance(ids, slice)
+                else ids[rows]
+            )
+            entered = self.mode[at] != index
+            parts.append(
+                Part(self.task.modes[index], index, rows, at, entered if bool(entered.any()) else None)
+            )
+        return Crew(len(modes), parts)
+
+    def act(self, crew: Crew, x: Tensor, u: Tensor, k: int) -> Tensor:
         """Let each world's mode choose its input; a mode that was not running before is entered first.
 
         Args:
-            ids: worlds, n of them.
-            modes: the mode of each at this step, (n,) long.
+            crew: who acts in which of n worlds.
             x: their states, (n, nx).
             u: their last inputs, (n, nu).
             k: control step.
@@ -76,56 +96,66 @@ class Worlds:
         Returns:
             The inputs to apply, (n, nu). The worlds' memory is already that after the step.
         """
-        n, ids, remembers = len(modes), where(ids), self.task.modes.memory_size > 0
-        memory, entered = fresh(self.memory, ids), modes != self.mode[ids]
-        order, groups = _groups(modes, len(self.task.modes))
-        if order is not None:  # side by side, what is in one mode needs no more indexing
-            x, u, entered = x[order], u[order], entered[order]
-            memory = memory[order] if remembers else memory
-        if remembers:
-            memory[entered] = 0.0
-        ks = torch.full((n,), k, device=modes.device)
-        parts = zip(
-            groups, *(each.split(list(groups.values())) for each in (x, u, memory, entered, ks)), strict=True
-        )
-        actions = [self._act(self.task.modes[index], *part) for index, *part in parts]
-        action = torch.cat(actions) if len(actions) > 1 else actions[0]
-        if order is not None:
-            action = torch.empty_like(action).index_copy_(0, order, action)
-            memory = torch.empty_like(memory).index_copy_(0, order, memory) if remembers else memory
-        self.mode[ids] = modes
-        if remembers:
-            self.memory[ids] = memory
+        if len(crew.parts) == 1:
+            return self._act(crew.parts[0], x, u, k)
+        action = u.new_empty(crew.size, self.sim.nu)
+        for part in crew.parts:
+            action[part.rows] = self._act(part, x[part.rows], u[part.rows], k)
         return action
 
-    def _act(self, mode: Mode, x: Tensor, u: Tensor, memory: Tensor, entered: Tensor, k: Tensor) -> Tensor:
-        """Inputs of worlds that are all in one mode, (n, nu); their `memory` is brought up to date."""
-        n, size = len(x), mode.memory_size
-        memory = memory[:, :size]
-        if size > 0 and bool(entered.any()):
-            start = mode.reset(x[entered], u[entered], k[entered])
-            start = _shaped(mode, "reset() memory", start, (int(entered.sum()), size))
-            memory[entered] = start.to(memory.dtype)
+    def _act(self, part: Part, x: Tensor, u: Tensor, k: int) -> Tensor:
+        """Inputs of worlds that are all in one mode, (n, nu)."""
+        mode, n, size = part.mode, len(x), part.mode.memory_size
+        ks = torch.full((n,), k, device=x.device)
+        if part.entered is not None:
+            self._enter(part, x, u, ks)
+        memory = self.memory[part.at, :size]
         nested = mode.control_steps
-        action, after = mode.act(x, u, memory, k)
+        action, after = mode.act(x, u, memory, ks)
         self.nested_steps += mode.control_steps - nested
-        if size > 0:
-            memory[:] = _shaped(mode, "act() memory", after, (n, size))
+        if size > 0 and after is not memory:
+            self.memory[part.at, :size] = _shaped(mode, "act() memory", after, (n, size)).to(memory.dtype)
         return _shaped(mode, "act() actions", action, (n, self.sim.nu)).to(u.dtype)
 
+    def _enter(self, part: Part, x: Tensor, u: Tensor, k: Tensor) -> None:
+        """Begin a mode in the worlds that enter it."""
+        new, part.entered = part.entered, None
+        assert new is not None
+        at = self._all[part.at][new]
+        self.mode[at] = part.index
+        if self.task.modes.memory_size > 0:
+            self.memory[at] = 0.0
+        if (size := part.mode.memory_size) > 0:
+            start = part.mode.reset(x[new], u[new], k[new])
+            start = _shaped(part.mode, "reset() memory", start, (len(at), size))
+            self.memory[at, :size] = start.to(self.memory.dtype)
 
-def _groups(modes: Tensor, size: int) -> tuple[Tensor | None, dict[int, int]]:
-    """An order that brings equal ones of `modes` (n,) together, and how many there are of each of `size`.
 
-    None for the order where one mode has all.
+@dataclass
+class Part:
+    """Worlds in one mode.
+
+    Attributes:
+        mode: that acts.
+        index: its index.
+        rows: which of the crew's n worlds they are.
+        at: and which of the simulator's.
+        entered: those among them that enter the mode at the next step, bool; None for none of them.
     """
-    groups = {index: n for index, n in enumerate(modes.bincount(minlength=size).tolist()) if n > 0}
-    if len(groups) == 1:
-        return None, groups
-    if modes.device.type == "cpu":  # by counting, which torch does not for so few values
-        small = np.uint8 if size <= 256 else np.uint16 if size <= 65536 else np.int64
-        return torch.from_numpy(modes.numpy().astype(small).argsort(kind="stable")), groups
-    return modes.argsort(stable=True), groups
+
+    mode: Mode
+    index: int
+    rows: Tensor | slice
+    at: Tensor | slice
+    entered: Tensor | None
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Who acts in n worlds."""
+
+    size: int
+    parts: list[Part]
 
 
 def _shaped(mode: Mode, what: str, value: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -137,9 +167,3 @@ def _shaped(mode: Mode, what: str, value: Tensor, shape: tuple[int, int]) -> Ten
 def finite(values: Tensor) -> Tensor:
     """Which rows of (n, ...) hold finite numbers only, (n,) bool."""
     return values.isfinite().flatten(1).all(1)
-
-
-def stage_terms(task: Task, x: Tensor, u: Tensor, u_prev: Tensor, k: int, dt: float) -> Tensor:
-    """l dt, term by term, (n, number of stage terms) float64, at control step k."""
-    ks = torch.full((len(x),), k, device=x.device)
-    return task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64) * dt

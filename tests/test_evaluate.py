@@ -341,6 +341,30 @@ def test_a_trace_goes_on_from_any_step(exact, row, i, strength):
         assert not same, "the hidden input was to matter"
 
 
+@given(
+    rows=st.lists(st.lists(st.integers(0, 2), min_size=6, max_size=6), min_size=1, max_size=9),
+    trunk=st.lists(st.integers(0, 2), min_size=6, max_size=6),
+    pick=st.integers(0, 8),
+    bound=st.sampled_from([math.inf, 4.0]),
+)
+def test_a_schedule_of_the_last_batch_was_recorded_with_it(rows, trunk, pick, bound):
+    """To follow it takes no control step more, and its trace is that of a rollout of its own."""
+    task = toy_task(6)
+    rolled, alone = evaluator(task), evaluator(task)
+    rolled.follow(Schedule(tuple(trunk)))
+    chosen = Schedule(tuple(rows[pick % len(rows)]))
+    cost = float(rolled.costs(torch.tensor(rows), bound)[pick % len(rows)])
+    before = rolled.control_steps
+    assert rolled.follow(chosen) == alone.follow(chosen)
+    if cost < math.inf:
+        assert rolled.control_steps == before
+        assert rolled.pending == 0
+    rolled.record()
+    for part in ("x", "u", "memory", "mode", "snapshots", "stage", "terminal"):
+        assert torch.equal(getattr(rolled.trunk, part), getattr(alone.trunk, part)), part
+    assert rolled.trunk.modes == chosen.modes
+
+
 def test_a_trace_of_a_diverging_schedule_ends_there():
     whole = evaluator(toy_task(6, [Push(0.0), Push(50.0)], blow_up=1.5)).trace(Schedule((1,) * 6))
     assert whole.cost == math.inf

@@ -20,6 +20,8 @@ from hmc.go2.task import (
     stance_cost,
     timeline,
 )
+from hmc.modes import Motion
+from hmc.sampling import SamplingMpc
 from tools.random_policy import write_random_policy
 
 COMMAND = 60
@@ -142,14 +144,40 @@ def test_dense_guess():
 
 def test_jump_noise_is_mostly_symmetric():
     jump = jump_mode(JumpCfg(asymmetry=0.0), lambda n: make_sim(n, threads=1), seed=0)
+    assert isinstance(jump, SamplingMpc)
     eps = jump._along_basis(jump._noise(torch.tensor([0]), 0))
     assert torch.equal(eps[..., 0:3], eps[..., 3:6])
     assert torch.equal(eps[..., 6:9], eps[..., 9:12])
     assert not eps[..., [0, 3, 6, 9]].any(), "hips do not take part in symmetric motion"
     assert eps[0, 1:, :, [1, 2, 7, 8]].std(0).min() > 0
     loose = jump_mode(JumpCfg(asymmetry=0.2), lambda n: make_sim(n, threads=1), seed=0)
+    assert isinstance(loose, SamplingMpc)
     eps = loose._along_basis(loose._noise(torch.tensor([0]), 0))
     assert not torch.equal(*eps[..., [1, 4]].unbind(-1))
+
+
+def test_the_jump_as_a_motion():
+    """Without MPC the guess is played from the entry on, inside the joint limits, and its end is held."""
+    guess = ((0.0, -1.0, 2.0, -1.5), (0.4, -9.0, 2.0, -1.5))
+    jump = jump_mode(JumpCfg(guess=guess, spacing=2, mpc=False), None, 0)
+    x, u = FOOTSTAND.state()[None].repeat(2, 1), torch.zeros(2, 12, dtype=torch.float64)
+    k = torch.tensor([7, 40])
+    memory = jump.reset(x, u, k)
+    memory[1] = 1.0  # entered a step before
+    for step in range(5):
+        target, memory = jump.act(x, u, memory, k)
+        assert target[0, 1] == pytest.approx(min(0.2 * step, 0.4))
+        assert target[1, 4] == pytest.approx(min(0.2 * (step + 1), 0.4))
+        assert target[:, [2, 5]].min() >= go2.Q_LOWER[2]
+    assert jump.control_steps == 0
+    with pytest.raises(ValueError, match=r"jump\.guess is played, but it is empty"):
+        jump_mode(JumpCfg(mpc=False), None, 0)
+
+
+@pytest.mark.parametrize("inputs", [torch.zeros(0, 2), torch.zeros(3), torch.tensor([[math.nan]])])
+def test_a_motion_of_nothing_is_refused(inputs):
+    with pytest.raises(ValueError, match=r"mode 'wave': a motion is \(G, nu\) finite inputs"):
+        Motion("wave", inputs)
 
 
 def test_the_task(tmp_path):

@@ -14,6 +14,7 @@ from tensordict import TensorDict
 
 from hmc.go2 import model as go2
 from hmc.go2.facts import OBS_SIZE, contract
+from hmc.go2.network import LOWER, UPPER
 from hmc.go2.observe import anchor_of, observe
 from hmc.go2.policy import Policy
 from hmc.go2.stances import HANDSTAND, STANCES
@@ -59,7 +60,7 @@ def observations(n: int) -> torch.Tensor:
 
 def run(policy: Policy, obs: torch.Tensor) -> torch.Tensor:
     """The network's own output (n, 12)."""
-    return torch.from_numpy(policy._session.run(None, {"obs": obs.numpy()})[0])
+    return torch.from_numpy(policy.network.run(obs.numpy()))
 
 
 def edited(path: Path, out: Path, key: str, value: object) -> Path:
@@ -111,11 +112,11 @@ def test_the_mode(exported):
     )
     assert torch.equal(after, memory)
     action, _ = policy.act(1e4 * x, u, memory, k)
-    assert ((action >= go2.Q_LOWER) & (action <= go2.Q_UPPER)).all()
+    assert ((action.numpy() >= LOWER) & (action.numpy() <= UPPER)).all()
 
 
 def test_metadata(exported, checkpoint):
-    meta = Policy(exported).metadata
+    meta = Policy(exported).network.metadata
     assert {key: meta[key] for key in contract()} == contract()
     assert meta["mode"] == "handstand"
     assert meta["default_pose"] == pytest.approx(HANDSTAND.pose.tolist(), abs=1e-6)
@@ -222,7 +223,7 @@ def test_export_leaves_nothing_half_done(checkpoint, tmp_path):
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)
 def test_committed_policies(path):
     policy = Policy(path)
-    meta, stance = policy.metadata, STANCES[path.stem]
+    meta, stance = policy.network.metadata, STANCES[path.stem]
     assert meta["mode"] == path.stem
     assert meta["default_pose"] == pytest.approx(stance.pose.tolist(), abs=1e-6)
     assert meta["training_command"].startswith("python train/ppo.py ")

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from deploy.checks import StateChecks
 from deploy.codec import encode_state, seal
-from deploy.policy import LOWER, UPPER
 from deploy.remote import Button
 from deploy.safety import EMERGENCY, Body, Envelope, Inputs, Machine, Phase, limited, violations
 from deploy.settings import DeployCfg, EnvelopeCfg, InputCfg
 from hmc.cfg import load
 from hmc.go2 import facts
+from hmc.go2.network import LOWER, UPPER
 from tests.wire import state
 
 NOTHING = Button(0)

@@ -211,7 +211,7 @@ def test_searches_in_a_row_come_to_every_handover_before_they_come_to_one_again(
 def test_tails_are_spread_over_the_horizon():
     """Any 20 in a row leave no gap longer than a fifth of the horizon, and no mode less than a quarter."""
     space = SwitchSpace(3, 75)
-    order = tails(space, 0, 0)
+    order = list(tails(space, 0, 0))
     for i in range(0, len(order) - 20, 20):
         moments = sorted(tail.start for tail in order[i : i + 20])
         assert max(b - a for a, b in pairwise([0, *moments, 75])) <= 15

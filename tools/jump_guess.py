@@ -21,9 +21,12 @@ from torch import Tensor  # noqa: E402
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2 import model as go2  # noqa: E402
+from hmc.go2.conditions import Conditions  # noqa: E402
 from hmc.go2.stances import FOOTSTAND, HANDSTAND  # noqa: E402
-from hmc.go2.task import dense_guess, flip_task, make_sim  # noqa: E402
+from hmc.go2.task import dense_guess, flip_task  # noqa: E402
+from hmc.go2.variants import Variant, VariantsCfg, draw  # noqa: E402
 from hmc.sim.base import Sim  # noqa: E402
+from hmc.sim.mujoco import MujocoSim  # noqa: E402
 from hmc.task import Task  # noqa: E402
 from tools.closed_loop import RunCfg, disturbed_start  # noqa: E402
 
@@ -45,6 +48,8 @@ class Args:
         threads: of the engine; 0 for all cores.
         out: file to write the points to, as TOML.
         warm: begin with the guess in cfg/flip.toml.
+        conditions: a file with a table of this name, such as cfg/robustness.toml: every start is that of
+            another robot of its `variants`; by default all are the nominal one.
         set: overrides of cfg/flip.toml.
     """
 
@@ -60,14 +65,28 @@ class Args:
     threads: int = 0
     out: Path = ROOT / "out" / "jump_guess.toml"
     warm: bool = False
+    conditions: Path | None = None
     set: tuple[str, ...] = ()
 
 
-def settled_stands(task: Task, cfg: RunCfg, n: int, seed: int, threads: int) -> tuple[Tensor, Tensor]:
-    """n foot stands after 10 to 60 steps of the foot mode: states (n, 37), inputs (n, 12)."""
-    foot = task.modes["foot"]
+def robots_sim(robots: list[Variant], each: int, threads: int) -> MujocoSim:
+    """Worlds of these robots in turn, `each` times over."""
+    return MujocoSim(
+        go2.load_model(),
+        each * len(robots),
+        threads=threads,
+        latency=[robot.late() for robot in robots] * each,
+        models=[robot.model() for robot in robots] * each,
+    )
+
+
+def settled_stands(task: Task, cfg: RunCfg, sim: Sim, seed: int) -> tuple[Tensor, Tensor]:
+    """Foot stands after 10 to 60 steps of the foot mode, one a world: states (n, 37), inputs (n, 12).
+
+    A world whose own is no foot stand gets another one's.
+    """
+    foot, n = task.modes["foot"], sim.num_worlds
     pairs = [disturbed_start(cfg.start, seed + i) for i in range(n)]
-    sim = make_sim(n, threads=threads)
     sim.reset(torch.stack([x for x, _ in pairs]), torch.stack([u for _, u in pairs]))
     k = torch.zeros(n, dtype=torch.long)
     memory = foot.reset(sim.x(), sim.u(), k)
@@ -83,7 +102,9 @@ def settled_stands(task: Task, cfg: RunCfg, n: int, seed: int, threads: int) -> 
         raise ValueError(
             "the foot mode holds none of the starting stands: give a trained policy, task.foot=FILE"
         )
-    pick = good[torch.randint(len(good), (n,))]
+    pick = torch.arange(n)
+    bad = ~torch.isin(pick, good)
+    pick[bad] = good[torch.randint(len(good), (int(bad.sum()),))]
     return x[pick], u[pick]
 
 
@@ -135,26 +156,30 @@ def main(args: Args) -> None:
     with one_line_errors():
         cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
         task = flip_task(cfg.task, threads=args.threads)
-    worlds = args.candidates * args.starts * len(args.durations)
-    sim = make_sim(worlds, threads=args.threads)
+        variants = VariantsCfg()
+        if args.conditions is not None:
+            variants = load(args.conditions, Conditions, table="conditions").variants
+    generator = torch.Generator().manual_seed(args.seed)
     first = torch.tensor([[0.82, -1.6, 2.12, -1.16]], dtype=torch.float64)
     last = torch.tensor([[-0.966, -1.16, 1.7, -1.853]], dtype=torch.float64)
     w = torch.linspace(0, 1, args.points, dtype=torch.float64)[:, None]
     mean = torch.tensor(cfg.task.jump.guess, dtype=torch.float64) if args.warm else (1 - w) * first + w * last
     spread = torch.full_like(mean, args.spread)
-    durations = torch.tensor(args.durations).repeat(args.candidates * args.starts)
+    # worlds: candidates, durations, starts, the last ones next to each other
+    durations = torch.tensor(args.durations).repeat_interleave(args.starts).repeat(args.candidates)
     each = args.starts * len(args.durations)
     console = Console()
     for iteration in range(args.iterations):
         with one_line_errors():
             seed = 1000 * args.seed + iteration * args.starts
-            x, u = settled_stands(task, cfg, args.starts, seed, args.threads)
+            robots = draw(variants, args.starts, generator)
+            x, u = settled_stands(task, cfg, robots_sim(robots, 1, args.threads), seed)
         points = mean + spread * torch.randn(args.candidates, *mean.shape, dtype=torch.float64)
         points[0] = mean
         inputs = torch.stack([dense_guess(p, cfg.task.jump.spacing) for p in points])
         inputs = inputs.clamp(go2.Q_LOWER.double(), go2.Q_UPPER.double()).repeat_interleave(each, 0)
-        xs = x.repeat_interleave(len(args.durations), 0).repeat(args.candidates, 1)
-        us = u.repeat_interleave(len(args.durations), 0).repeat(args.candidates, 1)
+        repeats = args.candidates * len(args.durations)
+        sim, xs, us = robots_sim(robots, repeats, args.threads), x.repeat(repeats, 1), u.repeat(repeats, 1)
         end, touched = jump_and_catch(sim, task, xs, us, inputs, durations, max(args.durations) + args.settle)
         bad = torch.nan_to_num(badness(end, touched), nan=20.0)
         clean = (HANDSTAND.held(end) & ~touched).double().reshape(args.candidates, -1).mean(1)

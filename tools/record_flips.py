@@ -57,9 +57,9 @@ def main(args: Args) -> None:
     with one_line_errors():
         cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
         task = flip_task(cfg.task, seed=args.seed, threads=args.threads)
-        x, u = settled_stands(task, cfg, args.states, 1_000_000 * (args.seed + 1), args.threads)
+        sim = make_sim(args.states, threads=args.threads)
+        x, u = settled_stands(task, cfg, sim, 1_000_000 * (args.seed + 1))
     jump = task.modes["jump"]
-    sim = make_sim(args.states, threads=args.threads)
     sim.reset(x, u)
     after = torch.randint(args.first, args.last + 1, (args.states,))
     # every robot began its jump at a step of its own, so that their noise differs

@@ -18,7 +18,7 @@ from hmc.go2.observe import pitch
 from hmc.go2.task import JumpCfg, flip_task, make_sim, sampling_mode, timeline
 from hmc.sampling import METHODS, SamplingCfg
 from hmc.start import make_start
-from hmc.worlds import Worlds, finite, stage_terms
+from hmc.worlds import Worlds, finite
 from tools.closed_loop import Controller, RunCfg, chosen, disturbed_start, planned, run
 
 CONTROLLERS = {
@@ -115,14 +115,14 @@ def executed_costs(task: Task, cfg: RunCfg, rules: Sequence[Rule], seed: int) ->
     sim = task.make_sim(len(rules))
     worlds, follow = Worlds(task, sim), Sequencer(rules, cfg.task.command)
     worlds.reset(make_start(task, sim, *disturbed_start(cfg.start, seed)), None)
-    cost, everywhere = torch.zeros(len(rules), dtype=torch.float64), slice(0, len(rules))
+    cost = torch.zeros(len(rules), dtype=torch.float64)
     for k in range(round(cfg.seconds / sim.dt)):
         x, u_prev = sim.x(), sim.u()
         lost = ~finite(x)
         cost[lost] = math.inf
         x = torch.where(lost[:, None], x.new_tensor(0.0), x)
-        u = worlds.act(everywhere, follow(x, k), x, u_prev, k)
-        cost += stage_terms(task, x, u, u_prev, k, sim.dt).sum(1)
+        u = worlds.act(worlds.crew(None, follow(x, k)), x, u_prev, k)
+        cost += task.cost.stage_terms(x, u, u_prev, torch.full((len(x),), k)).sum(1) * sim.dt
         sim.step(u)
     return cost
 

@@ -145,7 +145,7 @@ def set_up(args: Args) -> tuple[Policy, Starts]:
     shares = {"stance": 0.0, "way": 0.0, "home": 0.0, "recorded": 0.0}
     shares["stance" if args.starts == "push" else args.starts] = 1.0
     cfg = StartsCfg(**shares, records=str(args.records.resolve()) if args.records else "")
-    starts = Starts(STANCES[policy.metadata["mode"]], cfg, torch.device("cpu"), unlocked=True)
+    starts = Starts(STANCES[policy.network.mode], cfg, torch.device("cpu"), unlocked=True)
     if args.starts == "recorded" and starts.records is not None and len(starts.records["x"]) < args.episodes:
         raise ValueError(
             f"{args.records} has {len(starts.records['x'])} states, too few for {args.episodes} episodes of "
@@ -170,7 +170,7 @@ def main(args: Args) -> None:
     good, found = measured(policy, starts, args.starts, args.episodes, conditions, args.threads)
     result = Score(int(good.sum()), args.episodes)
     reach, keep = PROTOCOLS[args.starts]
-    print(f"{policy.metadata['mode']} from {args.starts}: within {reach} s and held {keep} s: {result}")
+    print(f"{policy.network.mode} from {args.starts}: within {reach} s and held {keep} s: {result}")
     print(
         f"  while held: joint power {found.power:.1f} W, targets change by {found.rate:.3f} rad a step (rms)"
     )

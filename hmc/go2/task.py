@@ -17,7 +17,7 @@ from hmc.go2 import model as go2
 from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
-from hmc.modes import ModeSet
+from hmc.modes import Mode, ModeSet, Motion
 from hmc.sampling import SamplingCfg, SamplingMpc
 from hmc.sim.base import Sim
 from hmc.sim.mujoco import MujocoSim
@@ -60,6 +60,8 @@ class JumpCfg:
             written by tools/jump_guess.py; empty: hold the last input.
         asymmetry: noise of single joints relative to that of left-right symmetric motion.
         hip: noise of the hip joints relative to the others.
+        mpc: whether sampling MPC improves the guess on the way; else it is played as it is, which takes no
+            rollouts inside the mode.
     """
 
     sampling: SamplingCfg = field(default_factory=SamplingCfg)
@@ -68,6 +70,7 @@ class JumpCfg:
     guess: tuple[tuple[float, ...], ...] = ()
     asymmetry: float = 0.2
     hip: float = 0.3
+    mpc: bool = True
 
 
 @dataclass(frozen=True)
@@ -157,8 +160,13 @@ def policy_path(name: str, given: str = "") -> Path:
     return Path(given) if given else Path(str(resources.files("hmc.go2") / "policies" / f"{name}.onnx"))
 
 
-def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> SamplingMpc:
-    """The jump: MPPI towards the handstand."""
+def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Mode:
+    """The jump: MPPI towards the handstand, or the guess as it is."""
+    if not cfg.mpc:
+        if not cfg.guess:
+            raise ValueError("jump.mpc is false, so jump.guess is played, but it is empty: give its points")
+        inputs = dense_guess(torch.tensor(cfg.guess, dtype=torch.float64), cfg.spacing)
+        return Motion("jump", inputs.clamp(go2.Q_LOWER.double(), go2.Q_UPPER.double()))
     return sampling_mode("jump", cfg, make_sim, lambda k: torch.ones_like(k, dtype=torch.bool), seed)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import mujoco
+import numpy as np
 import torch
 from mujoco.batch import Batch
 from torch import Tensor
@@ -73,6 +74,7 @@ class MujocoSim:
         self._force = self.batch.bind("actuator_force")  # filled by steps after the bind, so bind now
         self._fresh = self._row[0].clone()
         self._all = torch.arange(num_worlds)
+        self._each = np.arange(num_worlds, dtype=np.int32)
 
     @property
     def num_worlds(self) -> int:
@@ -114,14 +116,15 @@ class MujocoSim:
 
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
-        index = self._all[ids] if isinstance(ids, slice) else ids
         # the engine takes indices in ascending order only
-        order = None if index is None else index.sort().values.numpy()
+        order = (
+            None if ids is None else self._each[ids] if isinstance(ids, slice) else ids.sort().values.numpy()
+        )
         if len(self._arrivals) == 1:
             self._ctrl[where(ids)] = u.to(torch.float64)
             self.batch.step(order, nstep=self._substeps)
             return
-        index = self._all if index is None else index
+        index = self._all if ids is None else self._all[ids] if isinstance(ids, slice) else ids
         for begin, end in pairwise([*self._arrivals, self._substeps]):
             now = self._late[index] == begin
             self._ctrl[index[now]] = u[now].to(torch.float64)
@@ -158,6 +161,11 @@ class MujocoSim:
     def actuator_force(self, ids: Ids = None) -> Tensor:
         """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
         return torch.tensor(self._force)[where(ids)]
+
+
+def _ascending(ids: Tensor) -> np.ndarray:
+    """World indices in the order in which the engine takes them."""
+    return ids.sort().values.numpy()
 
 
 def _quiet(message: str) -> None:

@@ -182,7 +182,7 @@ def _evaluator(
 ) -> None:
     """The planner's rollouts of single switches, costs included, against the steps that they come to."""
     cost = stance_cost(CostCfg(), lambda k: k >= 0)
-    other = Policy(policy.path, name="other", threads=args.threads)
+    other = Policy(policy.network.path, name="other", threads=args.threads)
     task = Task("hold", ModeSet([policy, other]), cost, args.steps, lambda n: sim)
     start = make_start(task, sim, HANDSTAND.state(), HANDSTAND.pose.double(), None, None, 0, None)
     space, worlds = SwitchSpace(2, args.steps), Worlds(task, sim)

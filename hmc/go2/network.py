@@ -1,0 +1,116 @@
+"""Policy files on onnxruntime and numpy alone: what planning and deployment share, without torch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from hmc.go2 import facts
+
+Array = NDArray[np.floating[Any]]
+
+LOWER, UPPER = np.array(facts.Q_LOWER), np.array(facts.Q_UPPER)
+
+# Entries of the rotation matrix, row by row: constant + factor (q_a q_b + sign q_c q_d), q = (w, x, y, z).
+_A, _B, _C, _D = np.array(
+    [
+        [2, 1, 1, 1, 1, 2, 1, 2, 1],
+        [2, 2, 3, 2, 1, 3, 3, 3, 1],
+        [3, 0, 0, 0, 3, 0, 0, 0, 2],
+        [3, 3, 2, 3, 3, 1, 2, 1, 2],
+    ]
+)
+_SIGN, _FACTOR, _CONSTANT = np.array(
+    [[1, -1, 1, 1, 1, -1, -1, 1, 1], [-2, 2, 2, 2, -2, 2, 2, 2, -2], [1, 0, 0, 0, 1, 0, 0, 0, 1]], float
+)
+
+
+def observe(x: Array, u: Array, anchor: Array) -> Array:
+    """Observation of policies, (n, 48): the numbers of `hmc.go2.observe.observe`, by the same operations.
+
+    Args:
+        x: states (n, 37): qpos (position, quaternion w x y z, joints), qvel (linear velocity in the world
+            frame, angular velocity in the body frame, joints).
+        u: previous action: joint targets [rad], (n, 12).
+        anchor: where the mode was entered, (n, 4): x, y [m], cos and sin of the heading.
+    """
+    quat = x[:, 3:7]
+    pairs = quat[:, _A] * quat[:, _B] + _SIGN * (quat[:, _C] * quat[:, _D])
+    turn = (_CONSTANT + _FACTOR * pairs).reshape(-1, 3, 3)
+    across = turn * x[:, 19:22, None]
+    dx, dy, c, s = x[:, 0] - anchor[:, 0], x[:, 1] - anchor[:, 1], anchor[:, 2], anchor[:, 3]
+    out = np.empty((len(x), facts.OBS_SIZE), x.dtype)
+    np.negative(turn[:, 2], out=out[:, :3])
+    out[:, 3] = c * dx + s * dy
+    out[:, 4] = c * dy - s * dx
+    out[:, 5] = x[:, 2]
+    out[:, 6:9] = across[:, 0] + across[:, 1] + across[:, 2]
+    out[:, 9:12] = x[:, 22:25]
+    out[:, 12:24] = x[:, 7:19]
+    out[:, 24:36] = x[:, 25:37]
+    out[:, 36:48] = u
+    return out
+
+
+class Network:
+    """Target = default_pose + action_scale x network(observation), inside the joint limits.
+
+    Attributes:
+        path: of the file.
+        metadata: its contract, see `hmc.go2.facts.contract`, and how it was made.
+        mode: its name there.
+
+    Args:
+        path: ONNX file with its contract in the metadata.
+        threads: of onnxruntime; 0 for all cores. Targets do not depend on it.
+
+    Raises:
+        ValueError: the file cannot be read, or a field of its contract does not match; names it.
+    """
+
+    def __init__(self, path: str | Path, threads: int = 1):
+        self.path = Path(path)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        # idle threads of the network must not spin on the cores that step worlds
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        if not self.path.is_file():
+            raise ValueError(f"policy {self.path}: no such file")
+        try:
+            self._session = onnxruntime.InferenceSession(
+                str(self.path), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:
+            raise ValueError(f"policy {self.path}: not a readable ONNX file ({error})") from error
+        fields = self._session.get_modelmeta().custom_metadata_map
+        self.metadata = {key: _decoded(text) for key, text in fields.items()}
+        if wrong := facts.disagreement(self.metadata):
+            raise ValueError(f"policy {self.path}: {wrong}")
+        self.mode = str(self.metadata["mode"])
+        self._pose = np.array(self.metadata["default_pose"], dtype=np.float64)
+        self._scale = float(self.metadata["action_scale"])
+
+    def act(self, x: Array, u: Array, anchor: Array) -> NDArray[np.float64]:
+        """Joint targets [rad], (n, 12); arguments as of `observe`."""
+        output = self.run(observe(x, u, anchor).astype(np.float32))
+        target = self._pose + self._scale * output.astype(np.float64)
+        return np.minimum(np.maximum(target, LOWER), UPPER)
+
+    def run(self, obs: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The network's output, (n, 12), for observations (n, 48)."""
+        (output,) = self._session.run(None, {"obs": obs})
+        return np.asarray(output)
+
+
+def _decoded(text: str) -> Any:
+    """A metadata value: JSON as we write it, else the text that another program wrote."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
