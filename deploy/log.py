@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -149,7 +148,7 @@ def read(path: Path) -> Iterator[tuple[str, float, Any]]:
         try:
             reader = make_reader(file)
             found = {record.name: record.metadata for record in reader.iter_metadata()}
-        except (McapError, ValueError, struct.error, EOFError) as error:
+        except Exception as error:  # mcap and its decompressors have no type in common for damage
             raise LogError(
                 f"log {path}: not a whole MCAP file ({type(error).__name__} {error}): a run that was cut "
                 "short leaves one that `mcap recover` can mend"
@@ -167,7 +166,7 @@ def read(path: Path) -> Iterator[tuple[str, float, Any]]:
                     1e-9 * message.log_time,
                     json.loads(message.data) if is_json else message.data,
                 )
-        except (McapError, ValueError, struct.error, EOFError) as error:
+        except Exception as error:
             raise LogError(f"log {path}: damaged ({type(error).__name__} {error})") from None
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
+from typing import TypeVar
 
 from deploy.dds import Link
 from deploy.messages import (
@@ -96,8 +97,8 @@ class MotionSwitcher:
             # a service that has not found us yet hears nothing; to hear a request twice does no harm
             self._requests.write(request)
             for octets in self._responses.take(RESEND):
-                answer = Response_.deserialize(octets)
-                if answer.header.identity == identity:
+                answer = _understood(Response_, octets)
+                if answer is not None and answer.header.identity == identity:
                     return _accepted(answer, f"{name} {parameter}")
         raise MotionSwitcherError(
             f"the motion switcher did not answer {name} within {self._timeout:g} s: is the robot still "
@@ -132,7 +133,9 @@ class MotionSwitcherService:
     def serve(self, timeout: float = 0.0) -> None:
         """Answer the requests that have come, waiting so long for the first one [s]."""
         for octets in self._requests.take(timeout):
-            request = Request_.deserialize(octets)
+            request = _understood(Request_, octets)
+            if request is None:
+                continue
             code, data = self._answer(request.header.identity.api_id, request.parameter)
             if not request.header.policy.noreply:
                 header = ResponseHeader_(request.header.identity, ResponseStatus_(code))
@@ -152,6 +155,17 @@ class MotionSwitcherService:
         except (ValueError, KeyError, TypeError):
             return BAD_PARAMETER, ""
         return OK, ""
+
+
+M = TypeVar("M", Request_, Response_)
+
+
+def _understood(kind: type[M], octets: bytes) -> M | None:
+    """The message, or None where the octets are none of its kind, such as text that is not UTF-8."""
+    try:
+        return kind.deserialize(octets)
+    except Exception:  # cyclonedds has no type of its own for what is wrong with octets
+        return None
 
 
 def _accepted(answer: Response_, request: str) -> str:

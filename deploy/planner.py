@@ -13,11 +13,13 @@ import numpy as np
 import torch
 
 from deploy.modes import FOOT, HAND, JUMP, NAMES, NONE, due
+from deploy.others import Others
 from deploy.process import ROOT, Job, allowed, told, until_told
 from deploy.settings import DeployCfg, PlanCfg
 from deploy.slots import PLAN, STEPS, Board
 from hmc import Evaluator, Schedule, Task, Trace, make_start, plan
 from hmc.cfg import load
+from hmc.go2.ensemble import EnsembleCfg
 from hmc.go2.model import DT
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import FlipCfg, flip_task
@@ -39,10 +41,16 @@ class PlannerCfg:
         first: effort of a plan then: the robot stands and can wait.
         search: effort of every other plan.
         mpc: whether the jump is planned by sampling MPC inside the plans; else its guess is played as it is.
+        others: robots that a flip is tried on before it is sent.
+        landed: share of them that have to end in the handstand.
+        patience: flips in a row that too few land, after which the first way is looked for anew.
     """
 
     lead: int = 45
     mpc: bool = False
+    others: EnsembleCfg = field(default_factory=EnsembleCfg)
+    landed: float = 0.8
+    patience: int = 5
     first: SearchCfg = field(default_factory=SearchCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
 
@@ -66,7 +74,8 @@ class Planner:
     Until the operator asks for the handstand, the whole horizon wants the foot stand. From then on,
     the moment at which the handstand is wanted moves along ahead of the robot, until a schedule is
     found that ends in it; then it stays where it is, and the plan is sent. A plan that leaves the foot
-    stand for anything but a handstand is not sent: the robot stands, and the search begins anew.
+    stand for anything but a handstand, or for one that too few other robots come to, is not sent: the robot
+    stands, and the search goes on.
 
     Attributes:
         task: what is planned.
@@ -110,6 +119,8 @@ class Planner:
             max(worlds_for(self.task, it.samples, 0, it.pairs + it.moves) for it in searches)
         )
         self._one = self.task.make_sim(1)
+        self._others = Others(self.task, cfg.others, seed=seed, threads=threads)
+        self._refused = 0  # flips in a row that too few of them landed
         self._shipped: dict[int, Shipped] = {}
         self._number = 0
         self._command: int | None = None  # tick from which the handstand is wanted
@@ -168,13 +179,22 @@ class Planner:
             return self._ship(state, begin, start, trace)
         if searching:
             known, self._known, self._guess = self._known, reached, list(found.schedule)
-            if not (known and reached):
+            if not (known and reached and self._agreed(start)):
                 return None
             self._command = begin + self._cfg.lead
         elif not reached:
             self._command, self._known, self._guess = None, False, list(found.schedule)
             trace = self._follow(start, [FOOT] * self._horizon)
         return self._ship(state, begin, start, trace)
+
+    def _agreed(self, start: Start) -> bool:
+        """Whether enough other robots land the flip that was found."""
+        wanted = self._cfg.landed * self._others.count
+        agreed = self._others.landed(start, self._guess) >= wanted
+        self._refused = 0 if agreed else self._refused + 1
+        if self._refused >= self._cfg.patience:
+            self._known, self._guess, self._refused = False, [FOOT] * self._horizon, 0
+        return agreed
 
     def _follow(self, start: Start, modes: Sequence[int], known: Trace | None = None) -> Trace:
         """What a schedule leads to."""

@@ -107,7 +107,7 @@ def test_it_is_the_same_again():
     assert one.robot.truth().qpos.tolist() == two.robot.truth().qpos.tolist()
 
 
-REACHED = {Phase.PASSIVE: 0.2, Phase.LIE: 0.5, Phase.STAND: 1.4, Phase.READY: 2.3, Phase.HYBRID: 3.0}
+REACHED = {Phase.PASSIVE: 0.05, Phase.LIE: 0.5, Phase.STAND: 1.4, Phase.READY: 2.3, Phase.HYBRID: 3.0}
 Change = Callable[[RobotState], RobotState]
 FAULTS: dict[str, Faults | Remote | str | Change] = {
     "drop": Faults(drop=1.0),
@@ -117,8 +117,8 @@ FAULTS: dict[str, Faults | Remote | str | Change] = {
     "repeated": lambda state: state._replace(tick=7),
     "restarted": lambda state: state._replace(tick=state.tick % 256),
     "out of range": lambda state: state._replace(q=UPPER + 0.5),
-    "too fast": lambda state: state._replace(dq=np.full(12, 40.0)),
-    "too strong": lambda state: state._replace(tau=1.3 * PEAK_TORQUE),
+    "too fast": lambda state: state._replace(dq=np.full(12, 50.0)),
+    "too strong": lambda state: state._replace(tau=1.8 * PEAK_TORQUE),
     "hot": lambda state: state._replace(temperature=np.full(12, 95)),
     "emergency": Remote(Button.L2 | Button.B),
     "select": Remote(Button.SELECT),

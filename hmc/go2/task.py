@@ -18,6 +18,7 @@ from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.modes import Mode, ModeSet, Motion
+from hmc.rules import Rules
 from hmc.sampling import SamplingCfg, SamplingMpc
 from hmc.sim.base import Sim
 from hmc.sim.mujoco import MujocoSim
@@ -62,6 +63,7 @@ class JumpCfg:
         hip: noise of the hip joints relative to the others.
         mpc: whether sampling MPC improves the guess on the way; else it is played as it is, which takes no
             rollouts inside the mode.
+        dwell: control steps that it runs at least before another mode takes over; 0: any number.
     """
 
     sampling: SamplingCfg = field(default_factory=SamplingCfg)
@@ -71,6 +73,7 @@ class JumpCfg:
     asymmetry: float = 0.2
     hip: float = 0.3
     mpc: bool = True
+    dwell: int = 0
 
 
 @dataclass(frozen=True)
@@ -230,4 +233,5 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
     )
     cost = stance_cost(cfg.cost, timeline(cfg.command))
     others = make_ensemble(cfg.ensemble, seed=seed, **coarse)
-    return Task("flip", modes, cost, cfg.horizon, sim, ensemble=others)
+    rules = Rules(dwell={"jump": cfg.jump.dwell}) if cfg.jump.dwell > 0 else None
+    return Task("flip", modes, cost, cfg.horizon, sim, rules=rules, ensemble=others)
