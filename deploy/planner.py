@@ -44,6 +44,9 @@ class PlannerCfg:
         others: robots that a flip is tried on before it is sent.
         landed: share of them that have to end in the handstand.
         patience: flips in a row that too few land, after which the first way is looked for anew.
+        commit: whether a flip that was sent is left alone until the handstand. A new plan is made for a state
+            0.2 s and more ahead, where planning takes so long: in flight that is worth less than a plan that
+            others landed.
     """
 
     lead: int = 45
@@ -51,6 +54,7 @@ class PlannerCfg:
     others: EnsembleCfg = field(default_factory=EnsembleCfg)
     landed: float = 0.8
     patience: int = 5
+    commit: bool = True
     first: SearchCfg = field(default_factory=SearchCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
 
@@ -139,6 +143,19 @@ class Planner:
         """Ticks that planning is expected to take."""
         expected = float(np.quantile(self.seconds, self._rules.quantile))
         return min(1 + math.ceil(expected / self._tick), self._rules.longest)
+
+    def committed(self, state: np.ndarray) -> bool:
+        """Whether a flip is under way that no plan is to interfere with.
+
+        Args:
+            state: value of the state's slot.
+        """
+        if self._command is None or not self._cfg.commit or int(state["mode"]) == HAND:
+            return False
+        if int(state["mode"]) == FOOT and int(state["k"]) > self._command:
+            self._command = None  # it was not taken over: the search goes on
+            return False
+        return True
 
     @torch.no_grad()
     def plan(self, state: np.ndarray, ahead: int) -> np.ndarray | None:
@@ -258,6 +275,8 @@ def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
             time.sleep(0.002 if last >= 0 else 0.05)
             continue
         last = int(state["k"])
+        if planner.committed(state):
+            continue
         record = planner.plan(state, planner.ahead)
         now = time.monotonic()
         planner.seconds.append(now - float(state["t"]))

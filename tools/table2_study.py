@@ -28,6 +28,7 @@ CONTROLLERS = {
     "untuned": "fixed sequence",
     "sequence": "fixed sequence, tuned",
     "pitch": "switches on pitch, tuned",
+    "motion": "schedules planned (ours), jump as a motion",
     "ours": "schedules planned (ours)",
 }
 FOOT, JUMP, HAND = range(3)
@@ -178,8 +179,10 @@ def jobs(cfg: Table2Cfg) -> list[Job]:
 def controller(cfg: Table2Cfg, rules: dict[str, Rule], job: Job) -> tuple[Controller, Task]:
     """A job's controller, and the task that its cost is of."""
     flip = cfg.flip.task
+    if job.controller == "motion":
+        flip = replace(flip, jump=replace(flip.jump, mpc=False))
     task = flip_task(flip, seed=job.seed, threads=1)
-    if job.controller == "ours":
+    if job.controller in ("motion", "ours"):
         return planned(cfg.flip, task, job.seed), task
     if job.controller in METHODS:
         settings = JumpCfg(replace(cfg.sampling, method=job.controller), flip.cost)

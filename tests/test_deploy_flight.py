@@ -1,0 +1,168 @@
+"""The whole deployment in lock step: planner, controller, estimator and stand-in, without clocks or wires."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from deploy.control import Control
+from deploy.loop import policies
+from deploy.modes import FOOT, HAND, JUMP, NONE, Plan
+from deploy.others import Others
+from deploy.planner import Planner, PlannerCfg
+from deploy.remote import Button, Remote
+from deploy.safety import Phase
+from deploy.settings import DeployCfg
+from deploy.slots import STATE
+from deploy.summary import stages
+from hmc import make_start
+from hmc.cfg import load
+from hmc.go2.ensemble import EnsembleCfg
+from hmc.go2.model import DT
+from hmc.go2.stances import FOOTSTAND, HANDSTAND
+from hmc.go2.task import FlipCfg
+from tools.robot.standin import Settings, StandIn
+
+CFG = load(Path("cfg/deploy.toml"), DeployCfg)
+
+
+def planner(delay: int, seed: int = 0, *overrides: str) -> Planner:
+    """As deployed, but it reckons with a planning time of so many ticks."""
+    task = load(Path("cfg/flip.toml"), FlipCfg, table="task")
+    made = Planner(
+        task, load(Path("cfg/planner.toml"), PlannerCfg, overrides), CFG.plan, seed=seed, threads=1
+    )
+    made.seconds = deque([delay * DT] * 3)
+    return made
+
+
+class Flight:
+    """A stand-in, its controller and its planner, whose plans take `delay` ticks to come."""
+
+    def __init__(self, seed: int, delay: int):
+        self.robot = StandIn(Settings(seed=seed, start="lying"))
+        self.robot.release(True)
+        self.control = Control(CFG, policies("", ""))
+        self.control.planner = True
+        self.planner = planner(delay, seed)
+        self.delay = delay
+        self.x: list[np.ndarray] = []  # true states at the ticks of the hybrid phase
+        self.modes: list[int] = []
+        self._sent: list[bytes] = []
+        self._coming: tuple[int, np.ndarray | None] | None = None  # tick at which a plan comes, and it
+        self._released = 0.3  # s: when START may be pressed next
+
+    def run(self, seconds: float) -> Flight:
+        """Until the handstand has lasted 4 s, or the robot is damped, or its time has come."""
+        while self.robot.time < seconds and self.control.phase != Phase.DAMPING and not self._landed:
+            self._press()
+            ticked = [self.control.hear(frame, self.robot.time) for frame in self.robot.step(self._sent)]
+            command = self.control.command
+            self._sent = [] if command is None else [command]
+            if any(ticked) and self.control.phase == Phase.HYBRID:
+                truth = self.robot.truth()
+                self.x.append(np.concatenate([truth.qpos, truth.qvel]))
+                self.modes.append(self.control.performer.mode)
+                self._plan()
+        return self
+
+    @property
+    def _landed(self) -> bool:
+        return self.modes[-200:] == [HAND] * 200
+
+    def _press(self) -> None:
+        """START, for 50 ms whenever it leads on; the handstand is asked for 2 s into the foot stand."""
+        control, t = self.control, self.robot.time
+        leads_on = control.phase in (Phase.PASSIVE, Phase.READY) or (
+            control.phase == Phase.LIE and control._posed()
+        )
+        if t > self._released and (leads_on or (control.phase == Phase.HYBRID and len(self.modes) > 100)):
+            self._released = t + 0.3 if control.asked < 0 else np.inf
+        pressed = t > self._released - 0.3 + 1e-9 and t < self._released - 0.25
+        self.robot.remote = Remote(Button.START if pressed else Button(0))
+
+    def _plan(self) -> None:
+        k = self.control.k
+        if self._coming is not None and k >= self._coming[0]:
+            if self._coming[1] is not None:
+                self.control.performer.offer(Plan.read(self._coming[1]))
+            self._coming = None
+        state = self.control.situation.copy()
+        if self._coming is None and not self.planner.committed(state):
+            self._coming = k + self.delay, self.planner.plan(state, self.planner.ahead)
+
+
+@pytest.mark.parametrize(
+    ("seed", "delay"), [(0, 12), *(pytest.param(seed, 25, marks=pytest.mark.deploy) for seed in range(1, 6))]
+)
+def test_from_lying_to_the_handstand(seed: int, delay: int) -> None:
+    """With plans that take 0.24 s, and half a second."""
+    flight = Flight(seed, delay).run(25.0)
+    found = stages(np.array(flight.x), flight.modes)
+    assert found is not None
+    assert found["success"], (found, flight.control.machine.reason)
+    assert flight.control.missed == 0
+    order = [mode for i, mode in enumerate(flight.modes) if i == 0 or mode != flight.modes[i - 1]]
+    assert [mode for mode in order if mode != NONE] == [FOOT, JUMP, HAND]
+    assert flight.modes.count(JUMP) >= 12  # the rule of cfg/flip.toml
+
+
+def situation(**fields: Any) -> np.ndarray:
+    """A state's slot: the foot stand at rest, the handstand asked for."""
+    state, x = np.zeros((), STATE), FOOTSTAND.state().numpy()
+    state["k"], state["x"], state["u"], state["running"] = 100, x, x[7:19], 1
+    state["mode"], state["entered"], state["anchor"] = FOOT, 50, (0.0, 0.0, 1.0, 0.0)
+    state["asked"] = 90
+    for name, value in fields.items():
+        state[name] = value
+    return state
+
+
+def test_a_flip_is_left_alone_until_the_handstand_and_given_up_if_it_is_not_taken_over() -> None:
+    it = planner(5)
+    assert not it.committed(situation())
+    record = None
+    for k in range(100, 200):
+        if (record := it.plan(situation(k=k), 5)) is not None:
+            break
+    assert record is not None
+    begin, modes = int(record["begin"]), record["modes"][: record["steps"]].tolist()
+    assert modes[0] == FOOT
+    assert modes[-1] == HAND
+    assert modes.count(JUMP) >= 12
+    assert it.committed(situation(k=begin))
+    assert it.committed(situation(k=begin + 30, mode=JUMP))
+    assert not it.committed(situation(k=begin + 60, mode=HAND))
+    assert not it.committed(situation(k=begin + 60))  # still in the foot stand
+    assert not it.committed(situation(k=begin + 1))  # and so the search goes on
+
+
+def test_before_it_is_asked_for_the_foot_stand_goes_on() -> None:
+    record = planner(5).plan(situation(asked=-1), 5)
+    assert record is not None
+    assert set(record["modes"][: record["steps"]].tolist()) == {FOOT}
+
+
+def test_a_flip_that_others_do_not_land_is_not_sent() -> None:
+    it = planner(5, 0, "landed=1.1", "patience=1")
+    assert all(it.plan(situation(k=k), 5) is None for k in range(100, 112))
+
+
+def test_other_robots_land_a_flip_and_not_a_fall() -> None:
+    it = planner(5)
+    others = Others(it.task, EnsembleCfg(members=8), seed=3, threads=1)
+    x = FOOTSTAND.state()
+    start = make_start(it.task, it._one, x, x[7:19], mode="foot", memory=[0.0, 0.0, 1.0, 0.0])
+    flip, fall = [FOOT] * 20 + [JUMP] * 18 + [HAND] * 62, [FOOT] * 20 + [HAND] * 80
+    assert others.landed(start, flip) >= 6
+    assert others.landed(start, fall) == 0
+    assert others.landed(start, flip) == others.landed(start, flip)
+    assert Others(it.task, EnsembleCfg(), threads=1).landed(start, flip) == 0
+    upside = make_start(it.task, it._one, HANDSTAND.state(), HANDSTAND.state()[7:19])
+    assert others.landed(upside, [HAND] * 50) >= 7
+    assert torch.isfinite(others._sim.x()).all()
