@@ -1,9 +1,17 @@
-"""Who presses the buttons in simulation: the program itself, through the stand-in's port for orders."""
+"""Who presses the buttons in simulation: the program itself, or the keyboard."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
+import random
+import select
 import socket
+import sys
+import termios
+import tty
+from typing import Protocol
 
 import numpy as np
 
@@ -27,9 +35,26 @@ class Port:
         """Hold these buttons of the remote, and no others."""
         self._socket.send(json.dumps({"remote": {"buttons": buttons}}).encode())
 
+    def push(self, force: float, direction: float, seconds: float) -> None:
+        """Push the trunk with `force` [N] towards `direction` [rad] for a while."""
+        along = (force * math.cos(direction), force * math.sin(direction), 0.0, seconds)
+        self._socket.send(json.dumps({"push": along}).encode())
+
     def close(self) -> None:
         """Give the socket back."""
         self._socket.close()
+
+
+class Presser(Protocol):
+    """Who presses the buttons."""
+
+    def see(self, status: np.ndarray) -> bool:
+        """Act on the newest status; whether the run is over."""
+        ...
+
+    def close(self) -> None:
+        """Nobody presses any more."""
+        ...
 
 
 class Operator:
@@ -68,3 +93,53 @@ class Operator:
         self._port.press("START")
         self._pressed, self._next = True, now + PRESS
         return False
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+KEYS = {"s": ("START",), "x": ("SELECT",), " ": ("L2", "B")}
+HELP = "keys: s START, x SELECT, space L2 and B, p a push, q the end"
+PUSH = 80.0, 0.1  # N and s: half a metre per second
+
+
+class Keyboard:
+    """Presses what is typed, see `HELP`; the run is over with q.
+
+    Args:
+        port: the stand-in's.
+        terminal: descriptor of a terminal; its settings are given back by `close`.
+
+    Raises:
+        ValueError: it is no terminal.
+    """
+
+    def __init__(self, port: Port, terminal: int | None = None):
+        self._terminal = sys.stdin.fileno() if terminal is None else terminal
+        if not os.isatty(self._terminal):
+            raise ValueError("the keyboard needs a terminal to read from: leave --keys out, or run it in one")
+        self._before = termios.tcgetattr(self._terminal)
+        tty.setcbreak(self._terminal)  # keys come at once, and Ctrl-C still ends the run
+        self._port = port
+        self._until: float | None = None  # when what is pressed is let go [s]
+
+    def see(self, status: np.ndarray) -> bool:
+        """Press what was typed since; whether the run is over."""
+        now = 0.02 * int(status["k"])
+        while select.select([self._terminal], [], [], 0.0)[0]:
+            key = os.read(self._terminal, 1).decode(errors="replace").lower()
+            if key in ("q", ""):
+                return True
+            if key == "p":
+                self._port.push(PUSH[0], random.uniform(-math.pi, math.pi), PUSH[1])
+            elif key in KEYS:
+                self._port.press(*KEYS[key])
+                self._until = now + PRESS
+        if self._until is not None and now >= self._until:
+            self._port.press()
+            self._until = None
+        return False
+
+    def close(self) -> None:
+        """Give the terminal its settings back."""
+        termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)

@@ -19,7 +19,7 @@ sys.path[0] = str(ROOT)  # not this folder, whose modules are deploy's
 import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 
-from deploy.buttons import Operator, Port  # noqa: E402
+from deploy.buttons import HELP, Keyboard, Operator, Port, Presser  # noqa: E402
 from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
 from deploy.log import pipe  # noqa: E402
 from deploy.loop import policies  # noqa: E402
@@ -56,6 +56,7 @@ class Args:
         task_set: overrides of the task in cfg/flip.toml, such as substeps=2.
         search: overrides of cfg/planner.toml, such as search.draws=16.
         threads: of the planner's engine; 0 for all cores.
+        keys: the keyboard has the remote's buttons, and pushes; on the stand-in only.
         speed: of the stand-in's clock, for slow motion where the machine is busy; 1 on a robot.
     """
 
@@ -72,6 +73,7 @@ class Args:
     task_set: tuple[str, ...] = ()
     search: tuple[str, ...] = ()
     threads: int = 0
+    keys: bool = False
     speed: float = 1.0
 
     @property
@@ -175,11 +177,16 @@ def run(args: Args, console: Console, port: Port | None) -> None:
             watch.append(spawn("watchdog", Job(**{**base, "pid": control.pid}), [board.descriptor]))
         planner = spawn("planner", Job(**base), [board.descriptor])
         stack.callback(_end, planner)
-        operator = Operator(port) if port is not None else None
+        operator: Presser | None = None
+        if port is not None:
+            operator = Keyboard(port) if args.keys else Operator(port)
+            stack.callback(operator.close)
+        if args.keys:
+            console.print(HELP, highlight=False)
         follow(board, control, operator, stack.enter_context(View(console)))
 
 
-def follow(board: Board, control: subprocess.Popen[str], operator: Operator | None, view: View) -> None:
+def follow(board: Board, control: subprocess.Popen[str], operator: Presser | None, view: View) -> None:
     """Show the status until the control process ends, or the operator in simulation says that it is over."""
     while control.poll() is None:
         time.sleep(LOOK)
@@ -200,6 +207,10 @@ def main(args: Args) -> int:
         if not 0 < args.speed <= 1 or (args.speed != 1 and not args.simulated):
             raise ValueError(
                 f"speed is above 0 and at most 1 on the stand-in, 1 on a robot; got {args.speed:g}"
+            )
+        if args.keys and not (args.simulated and sys.stdin.isatty()):
+            raise ValueError(
+                "--keys needs the stand-in and a terminal: on a robot, the operator has the remote"
             )
         args.out.mkdir(parents=True, exist_ok=True)
         for name in ("run.mcap", "truth.npz", "summary.json"):
