@@ -1,8 +1,15 @@
-"""The example of docs/planner.md does what it says, as it stands there."""
+"""The examples of the documents do what they say, as they stand there."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+
 import hmc
+from tools.random_policy import write_random_policy
 from tools.search_figure import draw, example
 
 
@@ -18,3 +25,18 @@ def test_the_example_swings_up(tmp_path, capsys):
     assert "of 22,650 switches" in capsys.readouterr().out
     draw(plan, tmp_path / "search.png")
     assert (tmp_path / "search.png").stat().st_size > 5000
+
+
+def test_a_policy_of_ones_own(tmp_path):
+    """The class of docs/own_robot.md, around a network of two layers that takes state and input."""
+    text = Path("docs/own_robot.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(code, names)
+    path = write_random_policy(tmp_path / "policy.onnx", hidden=(4,))
+    mode = names["MyPolicy"]("mine", str(path))
+    x, u = torch.randn(5, 36, dtype=torch.float64), torch.randn(5, 12, dtype=torch.float64)
+    action, memory = mode.act(x, u, mode.reset(x, u, torch.zeros(5)), torch.zeros(5))
+    assert (mode.name, action.shape, action.dtype, memory.shape) == ("mine", (5, 12), torch.float64, (5, 0))
+    one, _ = mode.act(x[2:3], u[2:3], memory[2:3], torch.zeros(1))
+    assert torch.equal(one, action[2:3])
