@@ -61,10 +61,14 @@ class Operator:
     """Presses START whenever the robot waits for it, asks for the handstand, and says when all is over.
 
     Times are the robot's: its ticks.
+
+    Args:
+        port: the stand-in's.
+        hold: of the foot stand before the handstand is asked for [s].
     """
 
-    def __init__(self, port: Port):
-        self._port = port
+    def __init__(self, port: Port, hold: float = HOLD):
+        self._port, self._hold = port, hold
         self._pressed = False
         self._next = 0.0  # when the next action may be taken [s]
         self._since: float | None = None  # since when the robot has stood on two feet [s]
@@ -87,7 +91,7 @@ class Operator:
         if self._pressed or now < self._next or phase == Phase.STAND:
             return False
         if phase == Phase.HYBRID:
-            if stood < HOLD:
+            if stood < self._hold:
                 return False
             self._asked, self._since = now, None
         self._port.press("START")

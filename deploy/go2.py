@@ -19,10 +19,11 @@ sys.path[0] = str(ROOT)  # not this folder, whose modules are deploy's
 import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 
-from deploy.buttons import HELP, Keyboard, Operator, Port, Presser  # noqa: E402
+from deploy.buttons import HELP, HOLD, Keyboard, Operator, Port, Presser  # noqa: E402
 from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
 from deploy.log import pipe  # noqa: E402
 from deploy.loop import policies  # noqa: E402
+from deploy.memory import Memory  # noqa: E402
 from deploy.process import ENVIRONMENT, Job, spawn  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
@@ -56,6 +57,7 @@ class Args:
         task_set: overrides of the task in cfg/flip.toml, such as substeps=2.
         search: overrides of cfg/planner.toml, such as search.draws=16.
         threads: of the planner's engine; 0 for all cores.
+        hold: of the foot stand before the handstand is asked for, on the stand-in [s].
         keys: the keyboard has the remote's buttons, and pushes; on the stand-in only.
         speed: of the stand-in's clock, for slow motion where the machine is busy; 1 on a robot.
     """
@@ -73,6 +75,7 @@ class Args:
     task_set: tuple[str, ...] = ()
     search: tuple[str, ...] = ()
     threads: int = 0
+    hold: float = HOLD
     keys: bool = False
     speed: float = 1.0
 
@@ -155,8 +158,12 @@ def _end_all(processes: list[subprocess.Popen[str]]) -> None:
         _end(process)
 
 
-def run(args: Args, console: Console, port: Port | None) -> None:
-    """Start all processes, show the run until it is over, end them so that the robot stays damped."""
+def run(args: Args, console: Console, port: Port | None) -> Memory:
+    """Start all processes, show the run until it is over, end them so that the robot stays damped.
+
+    Returns:
+        What memory they took.
+    """
     board, (source, sink) = Board(), pipe()
     job = args.job()
     base = {**vars(job), "board": board.descriptor}
@@ -179,17 +186,22 @@ def run(args: Args, console: Console, port: Port | None) -> None:
         stack.callback(_end, planner)
         operator: Presser | None = None
         if port is not None:
-            operator = Keyboard(port) if args.keys else Operator(port)
+            operator = Keyboard(port) if args.keys else Operator(port, args.hold)
             stack.callback(operator.close)
         if args.keys:
             console.print(HELP, highlight=False)
-        follow(board, control, operator, stack.enter_context(View(console)))
+        memory = Memory({"control": control.pid, "planner": planner.pid, "log": log.pid})
+        follow(board, control, operator, stack.enter_context(View(console)), memory)
+        return memory
 
 
-def follow(board: Board, control: subprocess.Popen[str], operator: Presser | None, view: View) -> None:
+def follow(
+    board: Board, control: subprocess.Popen[str], operator: Presser | None, view: View, memory: Memory
+) -> None:
     """Show the status until the control process ends, or the operator in simulation says that it is over."""
     while control.poll() is None:
         time.sleep(LOOK)
+        memory.look()
         status = board.status.read()
         if status is None:
             continue
@@ -216,20 +228,21 @@ def main(args: Args) -> int:
         for name in ("run.mcap", "truth.npz", "summary.json"):
             (args.out / name).unlink(missing_ok=True)
     truth = args.out / "truth.npz" if args.simulated else None
+    memory = Memory({})
     try:
         with contextlib.suppress(KeyboardInterrupt):
             if args.simulated:
                 with stand_in(args, args.job().domain) as port:
-                    run(args, console, port)
+                    memory = run(args, console, port)
             else:
-                run(args, console, None)
+                memory = run(args, console, None)
     except Ended as ended:
         # what was wrong, the process has said itself
         return 2 if ended.status in (1, 2) else 1
     from deploy.summary import summarise, write  # loads torch: seconds that the start need not wait for
 
     with one_line_errors():
-        summary = summarise(args.out / "run.mcap", truth)
+        summary = {**summarise(args.out / "run.mcap", truth), "memory_mb": memory.found}
     write(args.out / "summary.json", summary)
     console.print_json(data=summary)
     reached = summary["stages_true"] if args.simulated else summary["stages"]

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from deploy.control import TICK
+from deploy.ekf import R
 from deploy.log import read
 from deploy.modes import HAND, NAMES, NONE
 from deploy.safety import Phase
@@ -47,6 +48,7 @@ def summarise(log: Path, truth: Path | None = None) -> dict[str, Any]:
     return {
         "stages": stages(np.array([tick["x"] for tick in hybrid]), [tick["mode"] for tick in hybrid]),
         "stages_true": None if truth is None else _true(truth, hybrid),
+        "estimate": None if truth is None else accuracy(truth, hybrid),
         "ticks": len(ticks),
         "missed": end.get("missed"),
         "late_ms": percentiles,
@@ -76,12 +78,38 @@ def stages(x: np.ndarray, modes: list[int]) -> dict[str, bool] | None:
 
 def _true(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, bool] | None:
     """Stages of what really happened at the ticks of the hybrid phase."""
+    known, x = _meet(path, hybrid)
+    return stages(x, [tick["mode"] for tick in known])
+
+
+def accuracy(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, float] | None:
+    """How far the estimate was from the truth at the ticks of the hybrid phase; None where there are none.
+
+    Velocity [m/s] in the world frame, height [m]; `height_sigmas_max` is in standard deviations.
+    """
+    known, x = _meet(path, hybrid)
+    if not known:
+        return None
+    estimate = np.array([tick["x"] for tick in known])
+    sigma = np.sqrt([tick["variance"][R.start + 2] for tick in known])
+    height = np.abs(estimate[:, 2] - x[:, 2])
+    speed = np.linalg.norm(estimate[:, 19:22] - x[:, 19:22], axis=1)
+    return {
+        "velocity_rms": round(float(np.sqrt(np.mean(speed**2))), 4),
+        "height_max": round(float(height.max()), 4),
+        "height_last": round(float(height[-1]), 4),
+        "height_sigmas_max": round(float((height / np.maximum(sigma, 1e-6)).max()), 2),
+    }
+
+
+def _meet(path: Path, hybrid: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """The ticks at which the truth is known, and it, (n, 37)."""
     with np.load(path) as truth:
         row = {int(tick): i for i, tick in enumerate(truth["tick"])}
         known = [tick for tick in hybrid if tick["ms"] in row]
         rows = [row[tick["ms"]] for tick in known]
         x = np.hstack([truth["qpos"][rows], truth["qvel"][rows]]) if rows else np.empty((0, 37))
-    return stages(x, [tick["mode"] for tick in known])
+    return known, x
 
 
 def _runs(hybrid: list[dict[str, Any]]) -> str:

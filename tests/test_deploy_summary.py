@@ -1,0 +1,54 @@
+"""What a run came to: memory, and the estimate against the truth."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deploy import memory
+from deploy.ekf import R
+from deploy.memory import Memory
+from deploy.summary import accuracy
+from hmc.go2.stances import FOOTSTAND
+
+
+def test_memory_is_looked_at_once_it_is_warm(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("deploy.memory.time.monotonic", lambda: now[0])
+    it = Memory({"this": os.getpid(), "none": 2**22 - 1})
+    it.look()
+    assert it.found == {}
+    now[0] = memory.WARM
+    it.look()
+    kept = np.ones(2**24)  # 128 MiB
+    now[0] += memory.EVERY / 2
+    it.look()  # too soon
+    assert it.found["this"][0] == it.found["this"][1] > 10
+    now[0] += memory.EVERY
+    it.look()
+    first, last = it.found["this"]
+    assert 100 < last - first < 300
+    assert "none" not in it.found
+    assert kept.any()
+
+
+def test_the_estimate_against_the_truth(tmp_path):
+    """Velocity off by (0.03, 0.04, 0), height by 2 cm at the end, where it is sure to 1 cm."""
+    x = np.tile(FOOTSTAND.state().numpy(), (4, 1))
+    np.savez(tmp_path / "truth.npz", tick=[20, 40, 60, 80], qpos=x[:, :19], qvel=x[:, 19:])
+    ticks: list[dict[str, Any]] = []
+    for i in range(4):
+        told, variance = x[i].copy(), np.full(27, 0.1)
+        told[19:21] += (0.03, 0.04)
+        told[2] += 0.02 if i == 3 else -0.001
+        variance[R] = (9.0, 9.0, 1e-4)
+        ticks.append({"ms": 20 * (i + 1), "x": told.tolist(), "variance": variance.tolist()})
+    ticks.append({**ticks[0], "ms": 999})  # whose truth is not known
+    found = accuracy(tmp_path / "truth.npz", ticks)
+    assert found == pytest.approx(
+        {"velocity_rms": 0.05, "height_max": 0.02, "height_last": 0.02, "height_sigmas_max": 2.0}
+    )
+    assert accuracy(tmp_path / "truth.npz", ticks[4:]) is None
