@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from hmc.budget import Budget as Budget
     from hmc.cost import Cost as Cost
     from hmc.ensemble import Ensemble as Ensemble
-    from hmc.ensemble import Member as Member
     from hmc.evaluate import Evaluator as Evaluator
     from hmc.modes import Mode as Mode
     from hmc.modes import ModeSet as ModeSet
@@ -34,7 +33,6 @@ _HOME = {
     "Budget": "hmc.budget",
     "Cost": "hmc.cost",
     "Ensemble": "hmc.ensemble",
-    "Member": "hmc.ensemble",
     "Evaluator": "hmc.evaluate",
     "Mode": "hmc.modes",
     "ModeSet": "hmc.modes",

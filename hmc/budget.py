@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from torch import Tensor
 
-from hmc.robust import AnyEvaluator
+from hmc.evaluate import Evaluator
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Meter:
     """A budget being spent by one search with one evaluator; time runs from its making."""
 
     budget: Budget
-    evaluator: AnyEvaluator
+    evaluator: Evaluator
     draws: int = 0
     began: float = field(default_factory=lambda: time.perf_counter())
 
@@ -77,7 +77,12 @@ class Meter:
         return int(np.searchsorted(needed, self.budget.control_steps - self.evaluator.control_steps, "right"))
 
     def settle(self) -> None:
-        """Record the schedule followed last if there is room for that: a next search goes on from it."""
+        """Record the schedule followed last if there is room for that: a next search goes on from it.
+
+        Not on an ensemble, whose members begin elsewhere then.
+        """
+        if self.evaluator.task.ensemble is not None:
+            return
         steps, limit = self.evaluator.pending * self._nested, self.budget.control_steps
         if not self.expired() and (limit is None or self.evaluator.control_steps + steps <= limit):
             self.evaluator.record()

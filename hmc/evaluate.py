@@ -18,7 +18,7 @@ from hmc.sim.base import Sim
 from hmc.start import Start
 from hmc.table import Table
 from hmc.task import Task
-from hmc.trace import Trace, root
+from hmc.trace import Trace, Traces, roots
 from hmc.worlds import Worlds
 
 
@@ -32,28 +32,35 @@ class Evaluator:
     Schedules that begin alike share the rollout of their beginning: with the one that `follow` recorded,
     and with each other as far as they fit into the simulator together.
 
+    Where the task has an ensemble, a schedule is rolled out on all of its members at once and costs their
+    risk. It is inf where one of them diverges or is barred; then, and once the risk is sure to exceed the
+    bound, none of them is stepped any more.
+
     Args:
         task: what to roll out.
-        sim: where; made with `task.make_sim`.
-        start: where from.
+        sim: where; made with `task.make_sim`. An ensemble has a simulator of its own, for as many schedules
+            at a time as this one has worlds.
+        start: where from; each member of an ensemble is `disturb`ed from there.
         known: a trace from earlier evaluations; where it meets `start` bit for bit, its steps are taken over.
+            None is, where an ensemble has several members.
 
     Attributes:
         rollouts: schedules rolled out so far.
-        diverged: schedules among them whose world stopped being finite.
+        diverged: schedules among them with a world that stopped being finite.
         pruned: schedules among them given up because they were sure to exceed the bound.
         ruled_out: schedules that the task's rules do not allow; their cost is inf.
     """
 
     def __init__(self, task: Task, sim: Sim, start: Start, known: Trace | None = None):
-        self.task, self.sim, self.start = task, sim, start
+        self.task, self.start, self.size = task, start, sim.num_worlds
+        self.sim = sim if task.ensemble is None else task.ensemble.sim(self.size)
         self.rollouts = self.diverged = self.pruned = self.ruled_out = 0
-        self._worlds = Worlds(task, sim)
-        self._trunk = root(self._worlds, start)
-        if known is not None and known.meets(self._trunk):
-            self._trunk = known
+        self._worlds = Worlds(task, self.sim)
+        self._trunk = roots(self._worlds, [start] if task.ensemble is None else task.ensemble.starts(start))
+        if known is not None and len(self._trunk) == 1 and known.meets(self.trunk):
+            self._trunk = (known,)
         self._next: Schedule | None = None  # to be recorded with the next batch
-        self._traces: dict[bytes, Callable[[], Trace]] = {}  # of the last batch, where they were kept
+        self._traces: dict[bytes, Callable[[], Traces]] = {}  # of the last batch, where they were kept
         self._table = Table(len(task.modes), len(task.cost.names))
 
     @property
@@ -68,16 +75,15 @@ class Evaluator:
 
     @property
     def trunk(self) -> Trace:
-        """The trace of the schedule recorded last."""
-        return self._trunk
+        """The trace of the schedule recorded last, on the first member."""
+        return self._trunk[0]
 
     @property
     def pending(self) -> int:
         """Control steps, modes' own aside, that it takes to record what is followed; 0 if it is recorded."""
         if self._next is None:
             return 0
-        lead = self._trunk.modes[: len(self._trunk)]
-        return int(added_steps(self._next.tensor()[None], lead)[1][0])
+        return len(self._trunk) * int(added_steps(self._next.tensor()[None], self._lead)[1][0])
 
     @torch.no_grad()
     def costs(
@@ -105,13 +111,13 @@ class Evaluator:
         fresh, rows = self._allowed(
             list(todo), torch.tensor(list(todo.values()), dtype=torch.long), schedules
         )
-        if len(fresh) > self.sim.num_worlds:  # neighbours share most: let them be in one chunk
-            order = in_order(schedules[rows].cpu(), self._trunk.modes[: len(self._trunk)])
+        if len(fresh) > self.size:  # neighbours share most: let them be in one chunk
+            order = in_order(schedules[rows].cpu(), self._lead)
             fresh, rows = [fresh[i] for i in order], rows[order]
         first = 0
         while first < len(fresh):
             beside = self._beside
-            size = self.sim.num_worlds - len(beside)
+            size = self.size - len(beside)
             chunk = slice(first, first + size)
             modes = beside[0].modes if beside else None
             rolled = roll(self._worlds, self._trunk, schedules[rows[chunk]], bound, stop, modes)
@@ -134,13 +140,13 @@ class Evaluator:
             new &= ~self._broken(schedules).cpu().numpy()
         wanted, horizon = schedules[torch.from_numpy(new)].cpu(), self.task.horizon
         ahead = [schedule.tensor()[None].to(wanted.dtype) for schedule in self._beside]
-        shared, alone = added_steps(torch.cat([*ahead, wanted]), self._trunk.modes[: len(self._trunk)])
+        shared, alone = added_steps(torch.cat([*ahead, wanted]), self._lead)
         # a part that does not fit into the simulator with those before it rolls one beginning out again
-        parts = np.arange(len(shared)) // max(1, self.sim.num_worlds - len(ahead))
+        parts = np.arange(len(shared)) // max(1, self.size - len(ahead))
         steps = shared.cumsum() + parts * horizon
         if not ahead:
             steps = np.minimum(steps, alone.cumsum())
-        return np.concatenate([[0], steps])[len(ahead) + new.cumsum()]
+        return len(self._trunk) * np.concatenate([[0], steps])[len(ahead) + new.cumsum()]
 
     @torch.no_grad()
     def follow(self, schedule: Schedule) -> float:
@@ -157,20 +163,23 @@ class Evaluator:
             cost = float(self._table.costs(found, math.inf)[0])
             if math.isfinite(cost) and key[0] in self._traces:
                 self._trunk = self._traces[key[0]]()
-            self._next = schedule if math.isfinite(cost) and schedule.modes != self._trunk.modes else None
+            self._next = schedule if math.isfinite(cost) and schedule.modes != self.trunk.modes else None
             return cost
         if found[0] < 0 and not self._allowed(key, torch.tensor([0]), rows)[0]:
             return math.inf
         self._next = schedule
         self.record()
         self._traces = {}
-        trunk = self._trunk
+        cost, terms, barred = self.trunk.cost, self.trunk.terms, self.trunk.barred
+        if self.task.ensemble is not None:
+            costs = torch.tensor([[each.cost for each in self._trunk]], dtype=torch.float64)
+            cost = float(self.task.ensemble.risk(costs)[0])
+            terms = self.task.ensemble.terms(torch.stack([each.terms for each in self._trunk])[None])[0]
         self.rollouts += 1
-        self.ruled_out += trunk.barred
-        self.diverged += not (math.isfinite(trunk.cost) or trunk.barred)
-        terms = trunk.terms.cpu().numpy()
-        self._table.learn(key, np.array([trunk.cost]), np.array([False]), terms[None])
-        return trunk.cost
+        self.ruled_out += barred
+        self.diverged += not (math.isfinite(cost) or barred)
+        self._table.learn(key, np.array([cost]), np.array([False]), terms.cpu().numpy()[None])
+        return cost
 
     @torch.no_grad()
     def record(self) -> None:
@@ -190,13 +199,18 @@ class Evaluator:
         return dict(zip(self.task.cost.names, terms.tolist(), strict=True))
 
     def trace(self, schedule: Schedule) -> Trace:
-        """The trajectory of one schedule; its control steps are not counted."""
-        return record(Worlds(self.task, self.sim), self._trunk, schedule)
+        """The trajectory of one schedule, on the first member; its control steps are not counted."""
+        return record(Worlds(self.task, self.sim), self._trunk, schedule)[0]
+
+    @property
+    def _lead(self) -> tuple[int, ...]:
+        """The modes of those steps that were recorded last."""
+        return self.trunk.modes[: len(self.trunk)]
 
     @property
     def _beside(self) -> list[Schedule]:
         """What the next batch is to record, if it has room for it."""
-        return [self._next] if self._next is not None and self.sim.num_worlds > 1 else []
+        return [self._next] if self._next is not None and self.size > 1 else []
 
     def _broken(self, schedules: Tensor) -> Tensor:
         """Which of schedules (N, T) break the task's rules, (N,) bool."""

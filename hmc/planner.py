@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hmc.budget import Budget, Meter
-from hmc.robust import make_evaluator
+from hmc.evaluate import Evaluator
 from hmc.schedule import Schedule, Switch, SwitchSpace
 from hmc.sim.base import Sim
 from hmc.solvers import ORDERS, SOLVERS, Search, run
@@ -39,11 +39,12 @@ class Plan:
         seen: switches of `schedule` that were evaluated and do not improve it.
         space_size: Z, how many there are.
         draws: switches evaluated in the whole search, repeats included.
-        rollouts: schedules rolled out; fewer than draws, as equal ones are rolled out once. This and the
-            other counts are not compared: what is pruned before it diverges depends on the simulator's size.
+        rollouts: schedules rolled out, one on all members of an ensemble counting once; fewer than draws, as
+            equal ones are rolled out once. This and the other counts are not compared: what is pruned before
+            it diverges depends on the simulator's size.
         control_steps: control steps rolled out, over all worlds and inside the modes; not compared, as
             schedules share their beginnings only where a batch fits into the simulator.
-        diverged: rollouts whose world stopped being finite; their cost is inf.
+        diverged: rollouts with a world that stopped being finite; their cost is inf.
         ruled_out: schedules that the task's rules do not allow; their cost is inf.
         fell_back: whether no schedule with a finite cost was found and `schedule` is the rules' fallback.
         stopped_by: "converged", "iterations", "draws", "control_steps", "seconds", "progress" or
@@ -234,7 +235,7 @@ def plan(
         u, mode, memory, k, snapshot = x.u, x.mode, x.memory if x.mode is not None else None, x.k, x.snapshot
         ran, x = x.ran, x.x
     start = make_start(task, sim, x, u, mode, memory, k, snapshot, ran)
-    meter = Meter(budget or Budget(), make_evaluator(task, sim, start, known))
+    meter = Meter(budget or Budget(), Evaluator(task, sim, start, known))
     incumbent = _incumbent(task, start, mode, schedule)
     if start.mode is not None and not math.isfinite(meter.evaluator.follow(incumbent)):
         stay = Schedule.constant(start.mode, task.horizon, task.modes.names)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from hmc.budget import Meter
+from hmc.evaluate import Evaluator
 from hmc.moves import handovers, moves
-from hmc.robust import AnyEvaluator
 from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
 
 Pairs = list[tuple[Switch, ...]]
@@ -40,7 +40,7 @@ class Search:
         stopped_by: why the search ended; None while it runs.
     """
 
-    evaluator: AnyEvaluator
+    evaluator: Evaluator
     meter: Meter
     schedule: Schedule
     samples: int

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from hmc.cost import total
 from hmc.schedule import Schedule
-from hmc.sim.ids import Ids, fresh
+from hmc.sim.ids import Ids, blocks, fresh
 from hmc.start import Start
 from hmc.task import Task
 from hmc.worlds import Worlds
@@ -129,14 +130,21 @@ class Trace:
         )
 
 
+Traces: TypeAlias = tuple[Trace, ...]  # of one schedule, on each member of an ensemble; as long as each other
+
+
 @torch.no_grad()
-def root(worlds: Worlds, start: Start) -> Trace:
-    """The trace of no steps at all from `start`, made in world 0."""
-    zero = torch.zeros(1, dtype=torch.long, device=worlds.sim.device)
-    worlds.reset(start, zero)
+def roots(worlds: Worlds, starts: Sequence[Start]) -> Traces:
+    """The traces of no steps at all, that of each member's start made in its first world."""
+    return tuple(_root(worlds, start, slice(e, e + 1)) for e, start in enumerate(starts))
+
+
+def _root(worlds: Worlds, start: Start, at: slice) -> Trace:
+    """The trace of no steps at all from `start`, made in world `at`."""
+    worlds.reset(start, at)
     stages, names = len(worlds.task.cost.stage), len(worlds.task.cost.names)
     none = torch.full((names,), math.nan, dtype=torch.float64, device=worlds.sim.device)
-    situation: dict[str, Any] = dict(zip(SITUATION, _situation(worlds, zero), strict=True))
+    situation: dict[str, Any] = dict(zip(SITUATION, _situation(worlds, at), strict=True))
     return Trace(
         worlds.task,
         (),
@@ -151,12 +159,14 @@ def root(worlds: Worlds, start: Start) -> Trace:
 class Recorder:
     """Takes down what happens to worlds while they are rolled out, for the traces of their schedules.
 
+    Branch j of the rollout is, on an ensemble's member e of E, world j E + e.
+
     Args:
-        known: the trace of an earlier schedule from the same start.
-        path: the one world to take down at each step i = 0 ... T, -1 for none; None takes down all.
+        known: the traces of an earlier schedule from the same starts, E of them.
+        path: the one branch to take down at each step i = 0 ... T, -1 for none; None takes down all.
     """
 
-    def __init__(self, known: Trace, path: list[int] | None):
+    def __init__(self, known: Traces, path: list[int] | None):
         self.known, self.path = known, path
         # by step: which worlds, and what of them
         self._rows: dict[int, tuple[Ids, tuple[Tensor, ...]]] = {}
@@ -164,68 +174,75 @@ class Recorder:
 
     def arrive(self, worlds: Worlds, i: int, ids: Ids, x: Tensor, u: Tensor) -> None:
         """Worlds `ids` have come to step i, in states x with last inputs u, (n, ...)."""
+        rows = slice(None)
         if self.path is not None:
-            place = _place(ids, self.path[i])
-            if place < 0:
+            place = self._place(ids, self.path[i])
+            if place is None:
                 return
-            ids, x, u = (
-                torch.tensor([self.path[i]], device=x.device),
-                x[place : place + 1],
-                u[place : place + 1],
-            )
-        self._rows[i] = ids, (x, u, *_rest(worlds, ids))
+            ids, rows = blocks(slice(self.path[i], self.path[i] + 1), len(self.known)), place
+        self._rows[i] = ids, (x[rows], u[rows], *_rest(worlds, ids))
 
     def step(self, i: int, ids: Ids, stage: Tensor) -> None:
         """Stage terms of worlds `ids` in step i, (number of stage terms, n)."""
         if self.path is not None:
-            place = _place(ids, self.path[i])
-            if place < 0:
+            place = self._place(ids, self.path[i])
+            if place is None:
                 return
-            ids, stage = torch.tensor([self.path[i]], device=stage.device), stage[:, place : place + 1]
+            ids, stage = blocks(slice(self.path[i], self.path[i] + 1), len(self.known)), stage[:, place]
         self._stage[i] = ids, stage
 
-    def trace(self, modes: tuple[int, ...], path: list[int], terminal: Tensor | None, barred: bool) -> Trace:
-        """The trace of a schedule.
+    def traces(
+        self, modes: tuple[int, ...], path: list[int], terminal: Tensor | None, barred: bool
+    ) -> Traces:
+        """The traces of a schedule; none goes on where another one ended.
 
         Args:
             modes: of the schedule, T.
-            path: the world that it was in at each step i = 0 ... T; -1 as long as it agrees with `known`.
-            terminal: its terminal terms, (number of terminal terms,); None where it did not come so far.
+            path: the branch that it was at each step i = 0 ... T; -1 as long as it agrees with `known`.
+            terminal: its terminal terms, (E, number of terminal terms); None where it did not come so far.
             barred: whether a guard barred its next mode.
         """
-        known = self.known
-        agree = next(i for i, world in enumerate(path) if world >= 0)
-        rows, stage = [], []
+        known, agree = self.known, next(i for i, branch in enumerate(path) if branch >= 0)
+        rows = [[torch.stack([getattr(each, part)[: agree + 1] for each in known], 1)] for part in SITUATION]
+        stage = [torch.stack([each.stage[:agree] for each in known], 1)]
         for i in range(agree, len(modes)):
-            ids, found = self._stage.get(i, (None, known.stage))
-            place = -1 if ids is None else _place(ids, path[i])
-            then, situation = self._rows.get(i + 1, (None, ()))
-            after = -1 if then is None else _place(then, path[i] if i + 1 == len(path) else path[i + 1])
-            if min(place, after) < 0 or not math.isfinite(float(found[:, place].sum())):
+            if i not in self._stage or i + 1 not in self._rows:
                 break
-            stage.append(found[None, :, place])
-            rows.append(tuple(part[after : after + 1] for part in situation))
-        before = [tuple(getattr(known, part)[: agree + 1] for part in SITUATION)]
-        parts = zip(SITUATION, zip(*before, *rows, strict=True), strict=True)
-        situation_of: dict[str, Any] = {part: torch.cat(column) for part, column in parts}
-        return Trace(
-            known.task,
-            modes,
-            known.k,
-            stage=torch.cat([known.stage[:agree], *stage]),
-            terminal=torch.full_like(known.terminal, math.nan) if terminal is None else terminal,
-            ran=known.ran,
-            barred=barred,
-            **situation_of,
+            (ids, found), (then, situation) = self._stage[i], self._rows[i + 1]
+            place, after = self._place(ids, path[i]), self._place(then, path[i + 1])
+            if place is None or after is None or not math.isfinite(float(found[:, place].sum())):
+                break
+            stage.append(found[None, :, place].mT)
+            for column, part in zip(rows, situation, strict=True):
+                column.append(part[None, after])
+        # steps first, then members
+        stages, columns = torch.cat(stage), [torch.cat(column) for column in rows]
+        found_of: list[dict[str, Any]] = [
+            dict(zip(SITUATION, [column[:, e] for column in columns], strict=True)) for e in range(len(known))
+        ]
+        return tuple(
+            Trace(
+                each.task,
+                modes,
+                each.k,
+                stage=stages[:, e],
+                terminal=torch.full_like(each.terminal, math.nan) if terminal is None else terminal[e],
+                ran=each.ran,
+                barred=barred,
+                **found_of[e],
+            )
+            for e, each in enumerate(known)
         )
 
-
-def _place(ids: Ids, world: int) -> int:
-    """Where in `ids` a world is; -1 where it is not."""
-    if isinstance(ids, Tensor):
-        found = (ids == world).nonzero()
-        return int(found[0]) if len(found) > 0 else -1
-    return world if ids is None or world in range(ids.start or 0, ids.stop) else -1
+    def _place(self, ids: Ids, branch: int) -> slice | None:
+        """Where in `ids` the worlds of a branch are, side by side; None where they are not."""
+        first = branch * len(self.known)
+        if isinstance(ids, Tensor):
+            found = (ids == first).nonzero()
+            place = int(found[0]) if len(found) > 0 else -1
+        else:
+            place = first if ids is None or first in range(ids.start or 0, ids.stop) else -1
+        return slice(place, place + len(self.known)) if place >= 0 else None
 
 
 def _rest(worlds: Worlds, ids: Ids) -> tuple[Tensor, ...]:

@@ -50,10 +50,10 @@ class Worlds:
             self.memory[ids] = 0.0
             self.memory[ids, : len(start.memory)] = start.memory
 
-    def branch(self, parents: Tensor, children: Ids) -> None:
+    def branch(self, parents: Ids, children: Ids) -> None:
         """Make worlds `children` (n,) copies of worlds `parents` (n,)."""
         self.sim.load(self.sim.save(parents), children)
-        children = where(children)
+        parents, children = where(parents), where(children)
         self.mode[children] = self.mode[parents]
         if self.task.modes.memory_size > 0:
             self.memory[children] = self.memory[parents]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -17,14 +18,23 @@ class ToySim:
     """x = (position, velocity), u (n, 1); a filtered input h that is not part of x drives the velocity.
 
     h is what an engine's warm start or actuator state is: a snapshot has it, `reset` clears it. It acts
-    with strength `hidden`. Everything is elementwise, hence the same in a batch of any size.
+    with strength `hidden`, of all worlds or of each. Everything is elementwise, hence the same in a batch of
+    any size.
     """
 
     nx, nu, dt = 2, 1, 0.5
     device, dtype = torch.device("cpu"), torch.float64
 
-    def __init__(self, num_worlds: int, hidden: float = 0.0, blow_up: float = math.inf):
-        self.num_worlds, self.hidden, self.blow_up = num_worlds, hidden, blow_up
+    def __init__(
+        self,
+        num_worlds: int,
+        hidden: float | Sequence[float] = 0.0,
+        blow_up: float | Sequence[float] = math.inf,
+    ):
+        self.num_worlds = num_worlds
+        self.hidden, self.blow_up = (
+            torch.tensor(value, dtype=torch.float64).expand(num_worlds) for value in (hidden, blow_up)
+        )
         self.rows = torch.zeros(num_worlds, 4, dtype=torch.float64)
         self.stepped: list[list[int]] = []
 
@@ -49,9 +59,9 @@ class ToySim:
     def step(self, u, ids=None):
         p, v, _, h = self.save(ids).unbind(1)
         h = 0.5 * h + u[:, 0]
-        v = v + self.dt * (u[:, 0] + self.hidden * h - torch.sin(2.0 * p))
+        v = v + self.dt * (u[:, 0] + self.hidden[self._at(ids)] * h - torch.sin(2.0 * p))
         p = p + self.dt * v
-        p = torch.where(p.abs() > self.blow_up, math.nan, p)
+        p = torch.where(p.abs() > self.blow_up[self._at(ids)], math.nan, p)
         self.rows[self._at(ids)] = torch.stack([p, v, u[:, 0], h], dim=1)
         self.stepped.append(torch.arange(self.num_worlds)[self._at(ids)].tolist())
 

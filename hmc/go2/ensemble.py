@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from hmc.ensemble import Ensemble, Member
+from hmc.ensemble import Ensemble
 from hmc.go2.model import SUBSTEPS, load_model
 from hmc.go2.variants import VariantsCfg, draw
+from hmc.sim.base import Sim
 from hmc.sim.mujoco import MujocoSim
 
 
@@ -57,18 +58,27 @@ def make_ensemble(
     def uniform(width: float, n: int) -> Tensor:
         return width * (2 * torch.rand(n, generator=generator, dtype=torch.float64) - 1)
 
-    found = [Member(partial(MujocoSim, load_model(substeps, iterations), substeps=substeps, threads=threads))]
+    models, late, errors = [load_model(substeps, iterations)], [0], [torch.zeros(37, dtype=torch.float64)]
     for variant in draw(cfg.variants, cfg.members, generator):
         error = torch.zeros(37, dtype=torch.float64)
         # the robot is where it measures itself less the error of its zeros
         error[7:19] = uniform(cfg.joints, 12) - torch.tensor(variant.zeros, dtype=torch.float64)
         error[19:22] = uniform(cfg.velocity, 3)
-        model = variant.model(substeps, iterations)
-        late = variant.late(substeps)
-        make_sim = partial(MujocoSim, model, substeps=substeps, threads=threads, latency=late)
-        found.append(Member(make_sim, partial(_beside, error=error)))
-    return Ensemble(found, cfg.tail)
+        models.append(variant.model(substeps, iterations))
+        late.append(variant.late(substeps))
+        errors.append(error)
 
+    def sim(members: Sequence[int]) -> Sim:
+        return MujocoSim(
+            models[0],
+            len(members),
+            substeps=substeps,
+            threads=threads,
+            latency=[late[i] for i in members],
+            models=[models[i] for i in members],
+        )
 
-def _beside(x: Tensor, u: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-    return x + error.to(x), u
+    def disturb(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        return x + torch.stack(errors).to(x), u.expand(len(errors), -1)
+
+    return Ensemble(len(models), sim, disturb=disturb, tail=cfg.tail)

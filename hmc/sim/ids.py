@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
+import torch
 from torch import Tensor
 
 # distinct world indices (n,), long; a slice; None for all worlds in order
@@ -20,6 +21,15 @@ def count(ids: Ids, worlds: int) -> int:
     if ids is None:
         return worlds
     return len(range(worlds)[ids]) if isinstance(ids, slice) else len(ids)
+
+
+def blocks(ids: Tensor | slice, size: int) -> Tensor | slice:
+    """The worlds of blocks of `size` side by side, of which `ids` are a few by index or a stretch."""
+    if size == 1:
+        return ids
+    if isinstance(ids, slice):
+        return slice(ids.start * size, ids.stop * size)
+    return (ids[:, None] * size + torch.arange(size, device=ids.device)).flatten()
 
 
 def fresh(buffer: Tensor, ids: Ids, dim: int = 0) -> Tensor:

@@ -73,7 +73,6 @@ class MujocoSim:
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._force = self.batch.bind("actuator_force")  # filled by steps after the bind, so bind now
         self._fresh = self._row[0].clone()
-        self._all = torch.arange(num_worlds)
         self._each = np.arange(num_worlds, dtype=np.int32)
 
     @property
@@ -124,10 +123,9 @@ class MujocoSim:
             self._ctrl[where(ids)] = u.to(torch.float64)
             self.batch.step(order, nstep=self._substeps)
             return
-        index = self._all if ids is None else self._all[ids] if isinstance(ids, slice) else ids
+        late, u, before = self._late[where(ids), None], u.to(torch.float64), self.u(ids)
         for begin, end in pairwise([*self._arrivals, self._substeps]):
-            now = self._late[index] == begin
-            self._ctrl[index[now]] = u[now].to(torch.float64)
+            self._ctrl[where(ids)] = u.where(late <= begin, before)
             if end > begin:
                 self.batch.step(order, nstep=end - begin)
 
@@ -161,11 +159,6 @@ class MujocoSim:
     def actuator_force(self, ids: Ids = None) -> Tensor:
         """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
         return torch.tensor(self._force)[where(ids)]
-
-
-def _ascending(ids: Tensor) -> np.ndarray:
-    """World indices in the order in which the engine takes them."""
-    return ids.sort().values.numpy()
 
 
 def _quiet(message: str) -> None:

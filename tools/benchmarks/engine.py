@@ -28,7 +28,7 @@ from hmc.sim.ids import Ids, where
 from hmc.sim.mujoco import MujocoSim
 from hmc.start import make_start
 from hmc.task import Task
-from hmc.trace import root
+from hmc.trace import roots
 from hmc.worlds import Worlds
 from tools.benchmarks.figures import Common, Figures
 from tools.random_policy import write_random_policy
@@ -188,7 +188,7 @@ def _evaluator(
     space, worlds = SwitchSpace(2, args.steps), Worlds(task, sim)
     into_other = torch.arange(len(space) // 2, len(space))[: args.worlds]
     schedules = space.stitch(Schedule.constant(0, args.steps), into_other)
-    trunk, step = root(worlds, start), sim.step
+    trunk, step = roots(worlds, [start]), sim.step
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def keep(u: Tensor, ids: Ids = None) -> None:
