@@ -123,6 +123,7 @@ def _costs(path: Path, traces: dict[str, list[Trace]], cfg: Table2Cfg) -> None:
     axis.set_xlabel("time [s]; dotted: the command")
     axis.set_ylabel("cost so far")
     axis.set_yscale("symlog", linthresh=1.0)
+    axis.set_ylim(bottom=0.0)
     axis.legend(fontsize=8)
     axis.margins(x=0)
     save(figure, path)

@@ -28,8 +28,8 @@ CONTROLLERS = {
     "untuned": "fixed sequence",
     "sequence": "fixed sequence, tuned",
     "pitch": "switches on pitch, tuned",
-    "motion": "schedules planned (ours), jump as a motion",
-    "ours": "schedules planned (ours)",
+    "motion": "planned, jump as a motion",
+    "ours": "planned, jump by MPPI",
 }
 FOOT, JUMP, HAND = range(3)
 NEVER = 1_000_000  # control steps
