@@ -45,6 +45,7 @@ class Evaluator:
             None is, where an ensemble has several members.
 
     Attributes:
+        size: schedules that are rolled out at a time.
         rollouts: schedules rolled out so far.
         diverged: schedules among them with a world that stopped being finite.
         pruned: schedules among them given up because they were sure to exceed the bound.

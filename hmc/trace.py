@@ -174,13 +174,12 @@ class Recorder:
 
     def arrive(self, worlds: Worlds, i: int, ids: Ids, x: Tensor, u: Tensor) -> None:
         """Worlds `ids` have come to step i, in states x with last inputs u, (n, ...)."""
-        rows = slice(None)
         if self.path is not None:
             place = self._place(ids, self.path[i])
             if place is None:
                 return
-            ids, rows = blocks(slice(self.path[i], self.path[i] + 1), len(self.known)), place
-        self._rows[i] = ids, (x[rows], u[rows], *_rest(worlds, ids))
+            ids, x, u = self._block(self.path[i]), x[place], u[place]
+        self._rows[i] = ids, (x, u, *_rest(worlds, ids))
 
     def step(self, i: int, ids: Ids, stage: Tensor) -> None:
         """Stage terms of worlds `ids` in step i, (number of stage terms, n)."""
@@ -188,7 +187,7 @@ class Recorder:
             place = self._place(ids, self.path[i])
             if place is None:
                 return
-            ids, stage = blocks(slice(self.path[i], self.path[i] + 1), len(self.known)), stage[:, place]
+            ids, stage = self._block(self.path[i]), stage[:, place]
         self._stage[i] = ids, stage
 
     def traces(
@@ -203,8 +202,7 @@ class Recorder:
             barred: whether a guard barred its next mode.
         """
         known, agree = self.known, next(i for i, branch in enumerate(path) if branch >= 0)
-        rows = [[torch.stack([getattr(each, part)[: agree + 1] for each in known], 1)] for part in SITUATION]
-        stage = [torch.stack([each.stage[:agree] for each in known], 1)]
+        stage, rows = [], []
         for i in range(agree, len(modes)):
             if i not in self._stage or i + 1 not in self._rows:
                 break
@@ -212,27 +210,36 @@ class Recorder:
             place, after = self._place(ids, path[i]), self._place(then, path[i + 1])
             if place is None or after is None or not math.isfinite(float(found[:, place].sum())):
                 break
-            stage.append(found[None, :, place].mT)
-            for column, part in zip(rows, situation, strict=True):
-                column.append(part[None, after])
+            stage.append(found[:, place])
+            rows.append([part[after] for part in situation])
         # steps first, then members
-        stages, columns = torch.cat(stage), [torch.cat(column) for column in rows]
-        found_of: list[dict[str, Any]] = [
-            dict(zip(SITUATION, [column[:, e] for column in columns], strict=True)) for e in range(len(known))
-        ]
-        return tuple(
-            Trace(
-                each.task,
+        stages = torch.stack([each.stage[:agree] for each in known], 1)
+        parts = {
+            name: torch.stack([getattr(each, name)[: agree + 1] for each in known], 1) for name in SITUATION
+        }
+        if rows:
+            stages = torch.cat([stages, torch.stack(stage).mT])
+            for name, column in zip(SITUATION, zip(*rows, strict=True), strict=True):
+                parts[name] = torch.cat([parts[name], torch.stack(column)])
+
+        def trace(e: int) -> Trace:
+            situation: dict[str, Any] = {name: part[:, e] for name, part in parts.items()}
+            return Trace(
+                known[e].task,
                 modes,
-                each.k,
+                known[e].k,
                 stage=stages[:, e],
-                terminal=torch.full_like(each.terminal, math.nan) if terminal is None else terminal[e],
-                ran=each.ran,
+                terminal=torch.full_like(known[e].terminal, math.nan) if terminal is None else terminal[e],
+                ran=known[e].ran,
                 barred=barred,
-                **found_of[e],
+                **situation,
             )
-            for e, each in enumerate(known)
-        )
+
+        return tuple(trace(e) for e in range(len(known)))
+
+    def _block(self, branch: int) -> Ids:
+        """The worlds of a branch."""
+        return blocks(slice(branch, branch + 1), len(self.known))
 
     def _place(self, ids: Ids, branch: int) -> slice | None:
         """Where in `ids` the worlds of a branch are, side by side; None where they are not."""

@@ -71,6 +71,7 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         args = Planner(**{**vars(args), "set": names + small})
         expected = expected | {"shared_fraction", "pruned_fraction", "mppi_overhead"}
         expected = expected | {"go2_tick_ms_p50", "go2_tick_ms_p99", "go2_control_steps_fraction"}
+        expected = expected | {"ensemble_3_fraction", "ensemble_5_fraction"}
 
     assert main(type(args)(**{**vars(args), "json": out})) == 0
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hmc import Receding, SwitchSpace, Task, plan
+from hmc import Evaluator, Receding, Schedule, SwitchSpace, Task, make_start, plan
 from hmc.cfg import load
 from hmc.cost import Cost
 from hmc.go2.model import SUBSTEPS, load_model
@@ -76,6 +76,7 @@ def planner(args: Planner) -> Figures:
         _omega(figures, args, run)
         _replan(figures, args, run)
         _ticks(figures, args, run)
+        _ensembles(figures, args, run)
     else:
         figures.notes["go2"] = "no policies: the Go2's part is left out"
     return figures
@@ -118,7 +119,7 @@ def _omega(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
         ("pruned_fraction", True, "sharing and pruning"),
     ):
         cost = replace(task.cost, nonnegative=nonnegative)
-        small = replace(task, modes=modes, cost=cost, horizon=args.horizon)
+        small = replace(task, modes=modes, cost=cost, horizon=args.horizon, rules=None)
         found = plan(small, x, u=u, schedule=["foot"] * args.horizon, solver="exhaustive", samples=size,
                      iterations=1, sim=small.make_sim(min(size, 1024)))  # fmt: skip
         figures.add(
@@ -185,6 +186,41 @@ def _ticks(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
     figures.add(
         "go2_control_steps_fraction", used / naive, "control steps used, MPPI's own included, over T x draws"
     )
+
+
+def _ensembles(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
+    """A batch of the flip's search on several models in step, against one model after the other."""
+    x, u = closed_loop.disturbed_start(cfg.start, 0)
+    draws, jump = cfg.search.samples + cfg.search.pairs + cfg.search.moves, replace(cfg.task.jump, mpc=False)
+    for others in (2, 4):
+        settings = replace(cfg.task, jump=jump, ensemble=replace(cfg.task.ensemble, members=others))
+        task = flip_task(settings, threads=args.threads)
+        assert task.ensemble is not None
+        space, foot = SwitchSpace(3, task.horizon), Schedule.constant(0, task.horizon)
+        at = torch.randperm(len(space), generator=torch.Generator().manual_seed(0))[:draws]
+        rows, sim = space.stitch(foot, at), task.make_sim(draws + 1)
+        start = make_start(task, sim, x, u, k=cfg.task.command)
+        alone, starts = replace(task, ensemble=None), task.ensemble.starts(start)
+        sims = [task.ensemble.make_sim([e] * (draws + 1)) for e in range(others + 1)]
+        took: list[list[float]] = [[], []]
+        for _ in range(args.repeats):
+            each = [Evaluator(alone, own, begin) for own, begin in zip(sims, starts, strict=True)]
+            took[0].append(_seconds([Evaluator(task, sim, start)], foot, rows))
+            took[1].append(_seconds(each, foot, rows))
+        figures.add(
+            f"ensemble_{others + 1}_fraction",
+            statistics.median(took[0]) / statistics.median(took[1]),
+            f"time of {draws + 1} schedules on {others + 1} models at once over that on one after the other",
+        )
+
+
+def _seconds(evaluators: list[Evaluator], incumbent: Schedule, schedules: Tensor) -> float:
+    """How long it takes to roll out an incumbent, then schedules (n, T) around it [s]."""
+    began = time.perf_counter()
+    for evaluator in evaluators:
+        evaluator.follow(incumbent)
+        evaluator.costs(schedules)
+    return time.perf_counter() - began
 
 
 class NullSim:
