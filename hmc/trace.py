@@ -169,10 +169,10 @@ class Recorder:
     def __init__(self, known: Traces, path: list[int] | None):
         self.known, self.path = known, path
         # by step: which worlds, and what of them
-        self._rows: dict[int, tuple[Ids, tuple[Tensor, ...]]] = {}
-        self._stage: dict[int, tuple[Ids, Tensor]] = {}
+        self._rows: dict[int, tuple[Tensor | slice, tuple[Tensor, ...]]] = {}
+        self._stage: dict[int, tuple[Tensor | slice, Tensor]] = {}
 
-    def arrive(self, worlds: Worlds, i: int, ids: Ids, x: Tensor, u: Tensor) -> None:
+    def arrive(self, worlds: Worlds, i: int, ids: Tensor | slice, x: Tensor, u: Tensor) -> None:
         """Worlds `ids` have come to step i, in states x with last inputs u, (n, ...)."""
         if self.path is not None:
             place = self._place(ids, self.path[i])
@@ -181,7 +181,7 @@ class Recorder:
             ids, x, u = self._block(self.path[i]), x[place], u[place]
         self._rows[i] = ids, (x, u, *_rest(worlds, ids))
 
-    def step(self, i: int, ids: Ids, stage: Tensor) -> None:
+    def step(self, i: int, ids: Tensor | slice, stage: Tensor) -> None:
         """Stage terms of worlds `ids` in step i, (number of stage terms, n)."""
         if self.path is not None:
             place = self._place(ids, self.path[i])
@@ -237,18 +237,18 @@ class Recorder:
 
         return tuple(trace(e) for e in range(len(known)))
 
-    def _block(self, branch: int) -> Ids:
+    def _block(self, branch: int) -> Tensor | slice:
         """The worlds of a branch."""
         return blocks(slice(branch, branch + 1), len(self.known))
 
-    def _place(self, ids: Ids, branch: int) -> slice | None:
+    def _place(self, ids: Tensor | slice, branch: int) -> slice | None:
         """Where in `ids` the worlds of a branch are, side by side; None where they are not."""
         first = branch * len(self.known)
         if isinstance(ids, Tensor):
             found = (ids == first).nonzero()
             place = int(found[0]) if len(found) > 0 else -1
         else:
-            place = first if ids is None or first in range(ids.start or 0, ids.stop) else -1
+            place = first - ids.start if ids.start <= first < ids.stop else -1
         return slice(place, place + len(self.known)) if place >= 0 else None
 
 

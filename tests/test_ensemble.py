@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hmc import Budget, Cost, Ensemble, Evaluator, Rules, Schedule, Start, Task, make_start, plan
+from hmc import Budget, Cost, Ensemble, Evaluator, Receding, Rules, Schedule, Start, Task, make_start, plan
 from hmc.rollout import Rolled, roll
 from hmc.sim.mixed import Mixed
 from hmc.trace import SITUATION, roots
@@ -69,13 +69,15 @@ def by_hand(modes) -> list[float]:
     return [slow_cost(task, modes, x) for task, x in zip(tasks, starts, strict=True)]
 
 
-def rolled_out(task: Task, rows: torch.Tensor, bound: float = math.inf, **start) -> tuple[Rolled, Worlds]:
+def rolled_out(
+    task: Task, rows: torch.Tensor, bound: float = math.inf, recorded=None, **start
+) -> tuple[Rolled, Worlds]:
     """Schedules (n, T) rolled out from nothing known."""
     assert task.ensemble is not None
-    worlds = Worlds(task, task.ensemble.sim(len(rows)))
+    worlds = Worlds(task, task.ensemble.sim(len(rows) + 1))
     begin = task.ensemble.starts(make_start(task, worlds.sim, X, **start))
     with torch.no_grad():
-        rolled = roll(worlds, roots(worlds, begin), rows, bound)
+        rolled = roll(worlds, roots(worlds, begin), rows, bound, recorded=recorded)
     assert rolled is not None
     return rolled, worlds
 
@@ -179,6 +181,21 @@ def test_what_is_recorded_of_each_member_is_its_own_trajectory(rows, host):
                 assert torch.equal(getattr(trace, part), getattr(own, part)), part
 
 
+def test_of_many_schedules_one_is_recorded_on_each_member():
+    task, one = robust(horizon=5), (0, 2, 2, 1, 2)
+    rows = all_schedules(3, 5)
+    rolled, worlds = rolled_out(task, rows, bound=0.1, recorded=one, **RUNNING)
+    assert rolled.traces is None
+    assert rolled.trace is not None
+    assert int(rolled.pruned.sum()) > 200, "what is recorded goes on whatever the bound"
+    for trace, member in zip(
+        rolled.trace, alone(task, make_start(task, worlds.sim, X, **RUNNING)), strict=True
+    ):
+        own = member.trace(Schedule(one))
+        for part in (*SITUATION, "stage", "terminal"):
+            assert torch.equal(getattr(trace, part), getattr(own, part)), part
+
+
 @given(
     tail=st.floats(0, 1), rank=st.integers(0, 80), num_worlds=st.integers(1, 90), looks_ahead=st.booleans()
 )
@@ -265,6 +282,19 @@ def test_a_cost_that_is_no_number_on_one_member_is_infinite(value, where, tail):
     assert ours.diverged == 1
 
 
+def test_an_input_that_is_no_number_on_one_member_ends_them_all():
+    class Fussy(Push):
+        name = "fussy"
+
+        def act(self, x, u, memory, k):
+            return torch.where(x[:, :1] > 0.65, math.nan, 0.5), memory
+
+    ours = evaluator(replace(toy_task(6, [Push(1.0), Fussy(0.5)]), ensemble=toys(1.0)))
+    costs = ours.costs(torch.tensor([[0] * 6, [1] * 6]))
+    assert costs.isinf().tolist() == [False, True]
+    assert (ours.diverged, ours.control_steps) == (1, 3 * 6)
+
+
 def test_a_guard_of_one_member_bars_them_all():
     """The third one begins right of 0.5, where damp may not be entered."""
     task = robust(horizon=6, rules=Rules(guards={"damp": lambda x, k: (x[:, 0] < 0.5) | (k > 5)}))
@@ -304,6 +334,22 @@ def test_a_plan_is_the_best_of_all_for_the_ensemble(tail, host):
 def test_a_draw_takes_a_rollout_of_each_member_out_of_the_budget(steps):
     found = plan(robust(), X, samples=8, pairs=4, budget=Budget(control_steps=steps))
     assert found.control_steps <= max(steps, 3 * 4), "the incumbent is always rolled out"
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_loop_plans_as_if_each_tick_were_the_first(exact):
+    """Members begin where the estimate says: nothing of the last tick is taken over."""
+    task = robust(horizon=6)
+    loop, sim = Receding(task, samples=4, iterations=1), ToySim(1)
+    sim.reset(torch.tensor([X], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64))
+    for _ in range(4):
+        x, before = sim.x()[0], loop.running
+        start = make_start(task, sim, x, sim.u()[0], before.mode, before.memory, loop.k, ran=before.ran)
+        tick = loop.tick(x, snapshot=sim.save()[0] if exact else None)
+        fresh = Evaluator(task, task.make_sim(8), start)
+        assert tick.plan.incumbent_cost == fresh.cost(tick.plan.incumbent)
+        assert tick.plan.cost == fresh.cost(tick.plan.schedule)
+        sim.step(tick.u[None])
 
 
 def test_an_ensemble_of_the_nominal_model_changes_nothing():

@@ -365,6 +365,20 @@ def test_a_schedule_of_the_last_batch_was_recorded_with_it(rows, trunk, pick, bo
     assert rolled.trunk.modes == chosen.modes
 
 
+@pytest.mark.parametrize("bound", [math.inf, 0.1])
+def test_among_many_the_schedule_followed_is_recorded(bound):
+    """Too many to record them all: the one that is followed goes on, wherever it is among them."""
+    rows, rolled, alone = all_schedules(3, 5), evaluator(toy_task(5), 300), evaluator(toy_task(5))
+    rolled.follow(Schedule((0, 1, 0, 0, 0)))
+    rolled.costs(rows[::2])
+    for modes in ((2, 1, 1, 0, 2), (0, 1, 2, 2, 0), (0, 0, 0, 0, 2)):
+        assert rolled.follow(Schedule(modes)) == alone.follow(Schedule(modes))
+        rolled.costs(rows if bound == math.inf else rows[1::2], bound)
+        rolled.record()
+        for part in ("x", "u", "memory", "mode", "snapshots", "stage", "terminal"):
+            assert torch.equal(getattr(rolled.trunk, part), getattr(alone.trunk, part)), part
+
+
 def test_a_trace_of_a_diverging_schedule_ends_there():
     whole = evaluator(toy_task(6, [Push(0.0), Push(50.0)], blow_up=1.5)).trace(Schedule((1,) * 6))
     assert whole.cost == math.inf
