@@ -13,6 +13,7 @@ b_w        9:12  bias of the gyroscope                                    rad/s
 b_f        12:15 bias of the accelerometer                                m/s^2
 p[0..3]    15:27 centres of the four foot spheres in the world frame      m
 c          27    creep of a loaded foot                                   m/s/N
+l          28    how late the gyroscope reads                             s
 ========== ===== ======================================================== ============
 
 The error of the attitude is the rotation vector phi with C = exp(phi) C_hat; all others are true minus
@@ -49,13 +50,14 @@ from deploy.so3 import Array, skew
 
 Flags = NDArray[np.bool_]
 Rows = Sequence[Sequence[float]]
-N = 28
+N = 29
 PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
-FEET, CREEP = slice(15, 27), 27
+FEET, CREEP, LATE = slice(15, 27), 27, 28
 GRAVITY = 9.81
 _I3 = np.eye(3)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
 _NO_FORCE = _FIRM = ((0.0, 0.0),) * 4
+_STEADY = np.zeros(3)
 
 
 def foot(leg: int) -> slice:
@@ -101,6 +103,7 @@ class NoiseCfg:
         roll: of the walk that comes with the shank's turning [m/sqrt(rad)]: wrong links and joint zeros,
             feet that are not quite spheres.
         creep: of a foot's creep before the first reading [m/s/N].
+        late: of how late the gyroscope reads [s].
         creep_walk: of its random walk, per square root of a second.
         kinematics: of a foot's place by kinematics that changes from reading to reading [m].
         ground: of the ground's height at a foothold [m].
@@ -119,6 +122,7 @@ class NoiseCfg:
     foot: float = 0.0015
     roll: float = 0.0045
     creep: float = 1e-3
+    late: float = 1e-3
     creep_walk: float = 3e-4
     kinematics: float = 0.0005
     ground: float = 0.01
@@ -131,8 +135,8 @@ class Ekf:
     Attributes:
         q: attitude (w, x, y, z), (4,); C its matrix, (3, 3).
         v, r, bw, bf, p: see the module; p is (4, 3).
-        creep: c of the module.
-        P: covariance of the error, (28, 28).
+        creep, late: c and l of the module.
+        P: covariance of the error, (29, 29).
         stands: which feet are anchored, (4,) bool.
     """
 
@@ -142,7 +146,7 @@ class Ekf:
         self.C = np.eye(3)
         self.v, self.r, self.bw, self.bf = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         self.p = np.zeros((4, 3))
-        self.creep = 0.0
+        self.creep = self.late = 0.0
         self.stands = np.zeros(4, dtype=bool)
         self.P = np.eye(N)
         self._F, self._still = np.eye(N), np.eye(N)
@@ -151,17 +155,19 @@ class Ekf:
         self._legs: tuple[int, ...] = ()
         self._e, self._PHt, self._S = np.empty(0), np.empty(0), np.empty(0)
 
-    def transition(self, f: Array, roll: Rows, pull: Rows, dt: float) -> Array:
-        """Jacobian of the error after a step by the error before it, (28, 28), to first order in dt.
+    def transition(self, f: Array, roll: Rows, pull: Rows, change: Array, dt: float) -> Array:
+        """Jacobian of the error after a step by the error before it, (29, 29), to first order in dt.
 
         Args:
             f: specific force without its bias, in the body frame [m/s^2], (3,).
             roll: rotation of each shank in the world frame over the step [rad], 4 of 3.
             pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
+            change: of the gyroscope's reading over the step [rad/s], (3,).
             dt: [s].
         """
         F, back = self._F, self.C * -dt
         F[PHI, BW] = F[V, BF] = back
+        F[PHI, LATE] = self.C @ change
         x, y, z = (back @ f).tolist()
         F[3, 1], F[3, 2], F[4, 0] = -z, y, z
         F[4, 2], F[5, 0], F[5, 1] = -x, -y, x
@@ -192,6 +198,7 @@ class Ekf:
         jump: Array | None = None,
         pull: Rows = _NO_FORCE,
         loose: Rows = _FIRM,
+        change: Array = _STEADY,
     ) -> None:
         """Move on by dt.
 
@@ -205,12 +212,13 @@ class Ekf:
             pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
             loose: what a foot's place walks beyond a standing foot's, variance per time [m^2/s], 4 of
                 (horizontal, vertical).
+            change: of the gyroscope's reading since the last step [rad/s], (3,).
         """
         w, f = gyro - self.bw, acc - self.bf
-        phi = w * dt
+        phi = w * dt + self.late * change
         roll = (phi + turn) @ self.C.T
         rows = roll.tolist()
-        F = self.transition(f, rows, pull, dt)
+        F = self.transition(f, rows, pull, change, dt)
         np.matmul(F, self.P, out=self._FP)
         P = np.matmul(self._FP, F.T)
         P += P.T
@@ -236,7 +244,7 @@ class Ekf:
         self.q, self.C = so3.turned(self.q, phi)
 
     def _walk(self, w: Array, f: Array, roll: Rows, dt: float, hidden: float, loose: Rows) -> list[float]:
-        """Diagonal of the step's noise, 28; `hidden` is the time [s^2] in which changes went unseen."""
+        """Diagonal of the step's noise, 29; `hidden` is the time [s^2] in which changes went unseen."""
         cfg = self.cfg
         shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
         speed = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
@@ -250,7 +258,7 @@ class Ekf:
             (x, y, z), (across, down) = roll[leg], loose[leg]
             foot = cfg.foot**2 * dt + cfg.roll**2 * math.sqrt(x * x + y * y + z * z)
             Q += (foot + across * dt, foot + across * dt, foot + down * dt)
-        Q.append(cfg.creep_walk**2 * dt)
+        Q += (cfg.creep_walk**2 * dt, 0.0)
         return Q
 
     def anchor(self, leg: int, s: Array) -> None:
@@ -305,7 +313,7 @@ class Ekf:
         return [distance(cells, e, 3 * k) for k in range(n)]
 
     def _rows(self, legs: tuple[int, ...]) -> Array:
-        """Jacobian of the residuals of some feet, (4 n, 28): places first, then heights."""
+        """Jacobian of the residuals of some feet, (4 n, 29): places first, then heights."""
         if legs not in self._H:
             n = len(legs)
             H = np.zeros((4 * n, N))
@@ -360,3 +368,4 @@ class Ekf:
         self.bw, self.bf = self.bw + d[BW], self.bf + d[BF]
         self.p += d[FEET].reshape(4, 3)
         self.creep += float(d[CREEP])
+        self.late += float(d[LATE])

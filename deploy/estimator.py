@@ -9,7 +9,7 @@ import numpy as np
 
 from deploy import so3
 from deploy.contact import ContactCfg, FootContact
-from deploy.ekf import BF, BW, CREEP, PHI, Ekf, Flags, NoiseCfg, R, V, distance
+from deploy.ekf import BF, BW, CREEP, LATE, PHI, Ekf, Flags, NoiseCfg, R, V, distance
 from deploy.estimate import Estimate
 from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, legs, lowest
 from deploy.so3 import Array
@@ -137,13 +137,13 @@ class Estimator:
             return self._estimate
 
         leg = chains(self._q)
-        imu, jump = self._imu, None
+        imu, jump, change = self._imu, None, self._imu[:3] - last[:3]
         if good and blind > 0.1 * self.cfg.period:
             # the gap gets the mean of the readings around it, the rest of the step its own
             jump = imu - last
             imu = imu - 0.5 * min(1.0, blind / dt) * jump
         turns = [chain.shank(*turned[3 * i : 3 * i + 3]) for i, chain in enumerate(leg)]
-        self.ekf.predict(imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt))
+        self.ekf.predict(imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt), change)
         used = self._feet(leg, tau.tolist(), force.tolist(), known, dt)
         self._estimate = self._output(used)
         return self._estimate
@@ -188,7 +188,7 @@ class Estimator:
         variance[PHI], variance[V] = (1.0, 1.0, 1e-8), stood.velocity_error**2
         variance[R] = 1e-8, 1e-8, noise.ground**2 if foot else _LYING**2
         variance[BW], variance[BF] = noise.gyro_bias**2, noise.acc_bias**2
-        variance[CREEP] = noise.creep**2
+        variance[CREEP], variance[LATE] = noise.creep**2, noise.late**2
         ekf.P = np.diag(variance)
         ekf.observe_rate(stood.rate, stood.rate_variance)
         ekf.observe_force(stood.force, np.full(3, stood.force_error**2))
