@@ -102,6 +102,7 @@ class NoiseCfg:
         foot: of a standing foot's random walk [m/sqrt(s)]: yielding ground.
         roll: of the walk that comes with the shank's turning [m/sqrt(rad)]: wrong links and joint zeros,
             feet that are not quite spheres.
+        slide: of the walk that comes with creep, relative to its speed [sqrt(s)].
         creep: of a foot's creep before the first reading [m/s/N].
         late: of how late the gyroscope reads [s].
         creep_walk: of its random walk, per square root of a second.
@@ -119,12 +120,13 @@ class NoiseCfg:
     acc_bias: float = 0.03
     turn: float = 20.0
     jerk: float = 100.0
-    foot: float = 0.0015
-    roll: float = 0.0045
+    foot: float = 0.0002
+    roll: float = 0.001
+    slide: float = 0.04
     creep: float = 1e-3
     late: float = 1e-3
     creep_walk: float = 3e-4
-    kinematics: float = 0.0005
+    kinematics: float = 0.0003
     ground: float = 0.01
     ground_time: float = 1.0
 
@@ -224,7 +226,7 @@ class Ekf:
         P += P.T
         P *= 0.5
         diagonal = P.reshape(-1)[:: N + 1]
-        diagonal += self._walk(w, f, rows, dt, 0.5 * gap * dt, loose)
+        diagonal += self._walk(w, f, rows, pull, dt, 0.5 * gap * dt, loose)
         if jump is not None:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P
@@ -243,19 +245,23 @@ class Ekf:
                 self.p[leg, 1] -= FOOT_RADIUS * x + creep * b
         self.q, self.C = so3.turned(self.q, phi)
 
-    def _walk(self, w: Array, f: Array, roll: Rows, dt: float, hidden: float, loose: Rows) -> list[float]:
+    def _walk(
+        self, w: Array, f: Array, roll: Rows, pull: Rows, dt: float, hidden: float, loose: Rows
+    ) -> list[float]:
         """Diagonal of the step's noise, 29; `hidden` is the time [s^2] in which changes went unseen."""
         cfg = self.cfg
         shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
         speed = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
         angle = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
         place, gyro, acc = speed * dt * dt / 3.0, cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
+        slide = (cfg.slide * self.creep) ** 2
         Q = [angle] * 3 + [speed] * 3 + [place] * 3 + [gyro] * 3 + [acc] * 3
         for leg, stands in enumerate(self.stands.tolist()):
             if not stands:
                 Q += (0.0, 0.0, 0.0)
                 continue
-            (x, y, z), (across, down) = roll[leg], loose[leg]
+            (x, y, z), (across, down), (a, b) = roll[leg], loose[leg], pull[leg]
+            across += slide * (a * a + b * b)
             foot = cfg.foot**2 * dt + cfg.roll**2 * math.sqrt(x * x + y * y + z * z)
             Q += (foot + across * dt, foot + across * dt, foot + down * dt)
         Q += (cfg.creep_walk**2 * dt, 0.0)
