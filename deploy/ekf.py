@@ -169,7 +169,9 @@ class Ekf:
         """
         F, back = self._F, self.C * -dt
         F[PHI, BW] = F[V, BF] = back
-        F[PHI, LATE] = self.C @ change
+        lag = self.C @ change
+        F[PHI, LATE] = lag
+        lag_x, lag_y, _ = (FOOT_RADIUS * lag).tolist()
         x, y, z = (back @ f).tolist()
         F[3, 1], F[3, 2], F[4, 0] = -z, y, z
         F[4, 2], F[5, 0], F[5, 1] = -x, -y, x
@@ -186,6 +188,7 @@ class Ekf:
             F[at, 0] = F[at + 1, 1] = -FOOT_RADIUS * z
             F[at, 2], F[at + 1, 2] = FOOT_RADIUS * x, FOOT_RADIUS * y
             F[at : at + 2, BW] = lever
+            F[at, LATE], F[at + 1, LATE] = lag_y, -lag_x
             x, y = pull[leg]
             F[at, CREEP], F[at + 1, CREEP] = -dt * x, -dt * y
         return F

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deploy import so3
-from deploy.contact import ContactCfg, FootContact
+from deploy.contact import ContactCfg, Fall, FallCfg, FootContact
 from deploy.ekf import BF, BW, CREEP, LATE, PHI, Ekf, Flags, NoiseCfg, R, V, distance
 from deploy.estimate import Estimate
-from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, legs, lowest
+from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, lowest
 from deploy.so3 import Array
 from deploy.start import Start, StartCfg
 
@@ -20,6 +20,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 _ALL: Flags = np.ones(4, dtype=bool)
 _IMU = (float(IMU[0]), float(IMU[1]), float(IMU[2]))
 _LYING = 0.03  # m, of the height of a body that lies: its outline is not all that well known
+_SELDOM = 10  # ticks from one look at the body's height to the next
 _ARM = 0.3  # m, of a joint about the foot: a stance's leg is between 0.2 and 0.42 long
 
 
@@ -30,7 +31,8 @@ class EstimatorCfg:
     Attributes:
         noise: standard deviations.
         contact: contact detection.
-        start: the still stand at the start.
+        start: the stand at the start.
+        fall: when the estimate counts as lost.
         flat: whether all footholds are at height 0, which keeps the height from drifting.
         period: of the readings [s]; longer steps have a gap that no reading covers.
         max_gap: without readings for longer, the estimator starts anew [s].
@@ -53,6 +55,7 @@ class EstimatorCfg:
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     contact: ContactCfg = field(default_factory=ContactCfg)
     start: StartCfg = field(default_factory=StartCfg)
+    fall: FallCfg = field(default_factory=FallCfg)
     flat: bool = True
     period: float = 0.002
     max_gap: float = 0.5
@@ -74,9 +77,9 @@ class EstimatorCfg:
 class Estimator:
     """Body state of the Go2 from IMU, joint encoders, joint torques and foot forces.
 
-    It begins with a still stand at any attitude, on two feet or four: the mean specific force gives the
-    gravity direction, the mean angular velocity the gyroscope's bias, both with honest covariances. The
-    heading there is 0, and x and y are 0.
+    It begins with a stand at any attitude, on two feet or four, or with a body that lies still: they give
+    gravity direction, velocity, height and the gyroscope's bias, with honest covariances (`deploy.start`). The
+    heading there is 0, and x and y are 0. After a fall that it cannot follow it begins anew by itself.
 
     Args:
         cfg: settings.
@@ -85,10 +88,12 @@ class Estimator:
         ekf: the Kalman ekf.
         detectors: contact detection of each foot.
         contact: what it says, (4,) bool.
+        falls: how often the estimate was lost and begun anew.
     """
 
     def __init__(self, cfg: EstimatorCfg | None = None):
         self.cfg = cfg or EstimatorCfg()
+        self.falls = 0
         self.reset()
 
     def reset(self) -> None:
@@ -105,13 +110,14 @@ class Estimator:
         self._pull = [(0.0, 0.0)] * 4  # horizontal force on each foot with contact [N]
         # variance of the speed of each foot since it touched down, horizontal and vertical [m^2/s^2]
         self._moves = [(0.0, 0.0)] * 4
+        self._fall, self._ticks, self._lowest = Fall(self.cfg.fall), 0, 0.0
         self._ready = False
         self._estimate: Estimate | None = None
 
     def update(
         self, t: float, gyro: Array, acc: Array, q: Array, qd: Array, tau: Array, force: Array
     ) -> Estimate | None:
-        """Take one tick's readings; None until the still stand at the start is over.
+        """Take one tick's readings; None until the stand at the start is over, and again after a fall.
 
         A tick that is not newer than the last changes nothing. Readings that are not finite, or out of the
         sensor's range, count as missing: the motion goes on as before, and feet with missing joints wait.
@@ -145,8 +151,23 @@ class Estimator:
         turns = [chain.shank(*turned[3 * i : 3 * i + 3]) for i, chain in enumerate(leg)]
         self.ekf.predict(imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt), change)
         used = self._feet(leg, tau.tolist(), force.tolist(), known, dt)
+        if self._fallen(leg, bool(used.any()), dt):
+            self.falls += 1
+            self.reset()
+            self._t = self._good = t
+            return None
         self._estimate = self._output(used)
         return self._estimate
+
+    def _fallen(self, leg: list[Chain], used: bool, dt: float) -> bool:
+        """Whether the estimate has lost the robot."""
+        if self._ticks % _SELDOM == 0:
+            x, y, z = up = self.ekf.C[2].tolist()
+            height, _ = lowest(leg, self._q, up)
+            base = float(self.ekf.r[2]) - (x * _IMU[0] + y * _IMU[1] + z * _IMU[2])
+            self._lowest = base + height if self.cfg.flat else 0.0
+        self._ticks += 1
+        return self._fall.update(used, bool(self.contact.any()), self._lowest, dt)
 
     def _readable(self, gyro: Array, acc: Array) -> bool:
         """Whether the IMU's readings are finite and within the sensor's range."""
@@ -180,7 +201,7 @@ class Estimator:
         ekf, noise = self.ekf, self.cfg.noise
         ekf.q = so3.aligning(stood.force / np.linalg.norm(stood.force), _UP)
         ekf.C = so3.matrix(ekf.q)
-        height, foot = lowest(legs(np.array(self._q)), np.array(self._q), ekf.C[2])
+        height, foot = lowest(chains(self._q), self._q, ekf.C[2].tolist())
         ekf.r[2], ekf.v = float(ekf.C[2] @ IMU) - height, ekf.C @ stood.velocity
 
         # all but unknown before the update with the mean specific force, which ties the tilt to the bias

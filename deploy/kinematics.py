@@ -122,19 +122,20 @@ _TRUNK = [(x, y, z) for x in (-0.19, 0.33) for y in (-0.05, 0.05) for z in (-0.1
 _KNEE = 0.017
 
 
-def lowest(leg: Legs, q: Array, up: Array) -> tuple[float, bool]:
-    """Height of the robot's lowest point from its base, and whether that is a foot [m].
+def lowest(four: list[Chain], q: list[float], up: Vector) -> tuple[float, bool]:
+    """Height of the robot's lowest point from its base [m], and whether that is a foot.
 
     Args:
-        leg: the legs at q.
-        q: joint angles [rad], (12,).
-        up: world z in the base frame, (3,).
+        four: the legs at q.
+        q: joint angles [rad], 12.
+        up: world z in the base frame.
     """
-    ux, uy, uz = up.tolist()
-    foot = float((leg.foot @ up).min()) - FOOT_RADIUS
+    ux, uy, uz = up
+    foot = min(ux * x + uy * y + uz * z for x, y, z in (leg.foot for leg in four)) - FOOT_RADIUS
     rest = min(ux * x + uy * y + uz * z for x, y, z in _TRUNK)
-    for (h, a, _), hip_x, hip_y, out in zip(q.reshape(4, 3).tolist(), _X, _Y, _OUT, strict=True):
-        ch, sh, d = math.cos(h), math.sin(h), LINK * math.cos(a)
-        x, y, z = hip_x - LINK * math.sin(a), hip_y + ch * out + sh * d, sh * out - ch * d
-        rest = min(rest, ux * x + uy * y + uz * z - _KNEE)
+    for i, leg in enumerate(four):
+        (ch, sh), a = leg.hip, q[3 * i + 1]
+        x, d = -LINK * math.sin(a), LINK * math.cos(a)
+        knee = ux * (_X[i] + x) + uy * (_Y[i] + ch * leg.out + sh * d) + uz * (sh * leg.out - ch * d)
+        rest = min(rest, knee - _KNEE)
     return min(foot, rest), foot <= rest
