@@ -54,6 +54,7 @@ N = 29
 PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 FEET, CREEP, LATE = slice(15, 27), 27, 28
 GRAVITY = 9.81
+_ARM = 0.4  # m, from the IMU to a foot
 _I3 = np.eye(3)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
 _NO_FORCE = _FIRM = ((0.0, 0.0),) * 4
@@ -72,11 +73,11 @@ def distance(S: list[list[float]], e: Sequence[float], at: int = 0) -> float:
     """
     second, third = S[at + 1], S[at + 2]
     b, d, c, f, g = second[at], second[at + 1], third[at], third[at + 1], third[at + 2]
-    l = math.sqrt(S[at][at])
-    m, n = b / l, c / l
+    k = math.sqrt(S[at][at])
+    m, n = b / k, c / k
     o = math.sqrt(d - m * m)
     p = (f - m * n) / o
-    x = e[at] / l
+    x = e[at] / k
     y = (e[at + 1] - m * x) / o
     z = e[at + 2] - n * x - p * y
     return x * x + y * y + z * z / (g - n * n - p * p)
@@ -122,7 +123,7 @@ class NoiseCfg:
     jerk: float = 100.0
     foot: float = 0.0002
     roll: float = 0.001
-    slide: float = 0.04
+    slide: float = 0.06
     creep: float = 1e-3
     late: float = 1e-3
     creep_walk: float = 3e-4
@@ -285,8 +286,16 @@ class Ekf:
         at, P = foot(leg), self.P
         P[at], P[:, at] = rows, rows.T
         block = rows[:, R] - rows[:, PHI] @ skew(arm).T
-        P[at, at] = 0.5 * (block + block.T) + self.cfg.kinematics**2 * _I3
+        P[at, at] = 0.5 * (block + block.T) + self._place_variance() * _I3
         self.stands[leg] = True
+
+    def _place_variance(self) -> float:
+        """Of a foot's place by kinematics, along an axis [m^2].
+
+        What is of second order in the tilt's error, (1/2) phi^2 s, would pass for knowledge of it.
+        """
+        tilt = float(self.P[0, 0] + self.P[1, 1])
+        return self.cfg.kinematics**2 + 0.5 * (_ARM * tilt) ** 2
 
     def release(self, leg: int) -> None:
         """A foot lifts off, or cannot be trusted."""
@@ -316,7 +325,7 @@ class Ekf:
         e += [FOOT_RADIUS - p[leg][2] for leg in legs]
         PHt = self.P @ H.T
         S = H @ PHt
-        S.reshape(-1)[:: 4 * n + 1][: 3 * n] += self.cfg.kinematics**2
+        S.reshape(-1)[:: 4 * n + 1][: 3 * n] += self._place_variance()
         self._legs, self._e, self._PHt, self._S = legs, np.array(e), PHt, S
         cells = S.tolist()
         return [distance(cells, e, 3 * k) for k in range(n)]
@@ -365,6 +374,10 @@ class Ekf:
         H[:, BW] = _I3
         PHt = self.P @ H.T
         self._update(gyro - self.bw, PHt, H @ PHt + np.diag(noise))
+
+    def observe_rest(self, variance: float) -> None:
+        """One update with a velocity of 0, of such a variance [m^2/s^2]."""
+        self._update(-self.v, self.P[:, V], self.P[V, V] + variance * _I3)
 
     def _update(self, e: Array, PHt: Array, S: Array) -> None:
         """Kalman update with residual e = H error + noise, whose covariance is S = H P H^T + noise."""

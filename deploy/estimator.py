@@ -9,7 +9,7 @@ import numpy as np
 
 from deploy import so3
 from deploy.contact import ContactCfg, Fall, FallCfg, FootContact
-from deploy.ekf import BF, BW, CREEP, LATE, PHI, Ekf, Flags, NoiseCfg, R, V, distance
+from deploy.ekf import BF, BW, CREEP, GRAVITY, LATE, PHI, Ekf, Flags, NoiseCfg, R, V, distance
 from deploy.estimate import Estimate
 from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, lowest
 from deploy.so3 import Array
@@ -20,6 +20,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 _ALL: Flags = np.ones(4, dtype=bool)
 _IMU = (float(IMU[0]), float(IMU[1]), float(IMU[2]))
 _LYING = 0.03  # m, of the height of a body that lies: its outline is not all that well known
+_CALM_RATE, _CALM_ACC = 0.1, 0.6  # rad/s, m/s^2: several times the noise of a reading
 _SELDOM = 10  # ticks from one look at the body's height to the next
 _ARM = 0.3  # m, of a joint about the foot: a stance's leg is between 0.2 and 0.42 long
 
@@ -48,6 +49,8 @@ class EstimatorCfg:
         patience: a foot left out for longer loses its anchor [s].
         lost: when all feet with contact are left out for this long, the velocity counts as lost [s].
         lost_speed: standard deviation added to it then [m/s].
+        rest: a body that neither turns nor accelerates for so long, without a foot on the ground, lies [s].
+        rest_speed: of such a body, standard deviation [m/s].
         max_gyro: range of the gyroscope, 2000 deg/s [rad/s].
         max_acc: range of the accelerometer, 16 g [m/s^2].
     """
@@ -70,6 +73,8 @@ class EstimatorCfg:
     patience: float = 0.01
     lost: float = 0.05
     lost_speed: float = 0.5
+    rest: float = 0.2
+    rest_speed: float = 0.03
     max_gyro: float = 35.0
     max_acc: float = 157.0
 
@@ -78,8 +83,8 @@ class Estimator:
     """Body state of the Go2 from IMU, joint encoders, joint torques and foot forces.
 
     It begins with a stand at any attitude, on two feet or four, or with a body that lies still: they give
-    gravity direction, velocity, height and the gyroscope's bias, with honest covariances (`deploy.start`). The
-    heading there is 0, and x and y are 0. After a fall that it cannot follow it begins anew by itself.
+    gravity direction, velocity, height and the gyroscope's bias, with honest covariances (`deploy.start`).
+    The heading there is 0, and x and y are 0. After a fall that it cannot follow it begins anew by itself.
 
     Args:
         cfg: settings.
@@ -106,7 +111,7 @@ class Estimator:
         self._imu = np.full(6, np.nan)  # of the last good tick
         self._q, self._qd = [math.nan] * 12, [0.0] * 12
         self._refused = [0.0] * 4  # for how long each foot has been left out [s]
-        self._lost = 0.0
+        self._lost = self._calm = 0.0
         self._pull = [(0.0, 0.0)] * 4  # horizontal force on each foot with contact [N]
         # variance of the speed of each foot since it touched down, horizontal and vertical [m^2/s^2]
         self._moves = [(0.0, 0.0)] * 4
@@ -149,15 +154,28 @@ class Estimator:
             jump = imu - last
             imu = imu - 0.5 * min(1.0, blind / dt) * jump
         turns = [chain.shank(*turned[3 * i : 3 * i + 3]) for i, chain in enumerate(leg)]
-        self.ekf.predict(imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt), change)
+        self.ekf.predict(
+            imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt), change
+        )
         used = self._feet(leg, tau.tolist(), force.tolist(), known, dt)
-        if self._fallen(leg, bool(used.any()), dt):
+        if self._fallen(leg, self._lies(dt) or bool(used.any()), dt):
             self.falls += 1
             self.reset()
             self._t = self._good = t
             return None
         self._estimate = self._output(used)
         return self._estimate
+
+    def _lies(self, dt: float) -> bool:
+        """Whether the body rests on something else than its feet; then its velocity is 0."""
+        cfg, (x, y, z) = self.cfg, (self._imu[:3] - self.ekf.bw).tolist()
+        size = math.sqrt(float(self._imu[3:] @ self._imu[3:]))
+        calm = x * x + y * y + z * z < _CALM_RATE**2 and abs(size - GRAVITY) < _CALM_ACC
+        self._calm = self._calm + dt if calm and not self.contact.any() else 0.0
+        if self._calm < cfg.rest:
+            return False
+        self.ekf.observe_rest(cfg.rest_speed**2)
+        return True
 
     def _fallen(self, leg: list[Chain], used: bool, dt: float) -> bool:
         """Whether the estimate has lost the robot."""
@@ -195,7 +213,9 @@ class Estimator:
         if not (good and math.isfinite(sum(self._q))):
             return
         loaded = [f > self.cfg.contact.on for f in force]
-        stood = self._start.take(self._imu, dt if dt < self.cfg.max_gap else self.cfg.period, self._q, self._qd, loaded)
+        stood = self._start.take(
+            self._imu, dt if dt < self.cfg.max_gap else self.cfg.period, self._q, self._qd, loaded
+        )
         if stood is None:
             return
         ekf, noise = self.ekf, self.cfg.noise
@@ -277,13 +297,13 @@ class Estimator:
         p, q, r = (self._imu[:3] - ekf.bw).tolist()
         x, y, z = chain.foot
         x, y, z = x - _IMU[0], y - _IMU[1], z - _IMU[2]
-        j, k, l = chain.rows
+        j, k, m = chain.rows
         foot = so3.rotated(
             C,
             (
                 q * z - r * y + j[0] * a + j[1] * b + j[2] * c,
                 r * x - p * z + k[0] * a + k[1] * b + k[2] * c,
-                p * y - q * x + l[0] * a + l[1] * b + l[2] * c,
+                p * y - q * x + m[0] * a + m[1] * b + m[2] * c,
             ),
         )
         d, e, f = chain.shank(a, b, c)
@@ -327,4 +347,3 @@ class Estimator:
             ekf.P.copy(),
             self.cfg.noise.gyro,
         )
-

@@ -24,13 +24,13 @@ IMU = np.array(facts.IMU)
 
 _X = (HIP_X, HIP_X, -HIP_X, -HIP_X)
 _Y = (HIP_Y, -HIP_Y, HIP_Y, -HIP_Y)
-_SINGULAR, _LEVEL = 1e-4, 1e-2  # m^2, m
+_SINGULAR, _LEVEL = 1e-4, 0.03  # m^2, m
 _OUT = (HIP_LENGTH, -HIP_LENGTH, HIP_LENGTH, -HIP_LENGTH)
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """One leg at one set of joint angles, in plain numbers: numpy takes longer over three of them than all this.
+    """One leg at one set of joint angles, in plain numbers: numpy takes longer over three than all this does.
 
     Attributes:
         foot: centre of the foot sphere in the base frame [m].
@@ -57,17 +57,17 @@ class Chain:
     def force(self, hip: float, thigh: float, calf: float) -> Vector:
         r"""Force of the ground on the foot in the base frame [N] by joint torques [N m]: -J^{-T} tau.
 
-        In the leg's plane thigh and calf tell forward and downward force; the hip tells the one across. The
-        leg counts as massless; a leg that is straight or level with its hip gets no force (0).
+        In the leg's plane thigh and calf tell forward and upward force; the hip tells the one across, the
+        worse the less the foot is below the hip: there it is damped to 0. The leg counts as massless.
         """
         (x, d), (shin_x, shin_d), (cos, sin) = self.thigh, self.shin, self.hip
         det = x * shin_d - d * shin_x
-        if abs(det) < _SINGULAR or abs(d) < _LEVEL:
+        if abs(det) < _SINGULAR:  # straight: beyond the joints' limits
             return 0.0, 0.0, 0.0
         # thigh = d ahead + x up, calf = shin_d ahead + shin_x up, hip = -d across - out up
         ahead = (x * calf - shin_x * thigh) / det
         up = (shin_d * thigh - d * calf) / det
-        across = (-hip - self.out * up) / d
+        across = -(hip + self.out * up) * d / (d * d + _LEVEL * _LEVEL)
         return ahead, cos * across - sin * up, sin * across + cos * up
 
 

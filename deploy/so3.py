@@ -77,7 +77,7 @@ def exp(phi: Array) -> Array:
 
 
 def turned(q: Array, phi: Array, world: bool = False) -> tuple[Array, Array]:
-    """Unit quaternion (4,) and matrix (3, 3) of q turned on by phi [rad], a vector in the body or world frame.
+    """Unit quaternion (4,) and matrix (3, 3) of q turned on by phi [rad] in the body's or the world's frame.
 
     The same as `quaternion`, `multiply` and `matrix` in turn, without the arrays between them.
     """

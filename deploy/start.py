@@ -5,7 +5,7 @@ seen from where the body was at the first reading,
 
 .. math:: \Phi(t) u(t) - \int \Phi f\, dt = v_0 + g\, t
 
-so that gravity is the slope of a line through what is measured, and the velocity at the start where it begins.
+so that gravity is the slope of a line through what is measured, and the velocity is where the line ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from deploy import so3
 from deploy.kinematics import FOOT_RADIUS, IMU, chains
 from deploy.so3 import Array
 
-_CORRELATED = 4  # readings that err together: a foot that slides does so for some ticks
+_CORRELATED = 3  # readings that err together: a foot that slides does so for some ticks
 _IMU = (float(IMU[0]), float(IMU[1]), float(IMU[2]))
 
 
@@ -41,7 +41,7 @@ class StartCfg:
     speed: float = 0.03
     outlier: float = 0.15
     rate: float = 0.005
-    acc: float = 0.1
+    acc: float = 0.07
     max_rate: float = 0.5
     max_acc: float = 2.0
 
@@ -66,7 +66,9 @@ class Stood:
     rate_variance: Array
 
 
-def foot_speed(q: list[float], qd: list[float], gyro: list[float], up: list[float], loaded: list[bool]) -> Array:
+def foot_speed(
+    q: list[float], qd: list[float], gyro: list[float], up: list[float], loaded: list[bool]
+) -> Array:
     r"""Velocity of the IMU in the body frame by the feet that carry it [m/s], (3,); NaN without any.
 
     .. math:: u = -w \times s_i - J_i \dot q_i + \rho \, w_i \times C^T e_z, averaged
@@ -113,7 +115,9 @@ class Start:
         self._turned, self._gained = np.eye(3), np.zeros(3)  # Phi, and the integral of Phi f
         self._rows: list[Array] = []  # t, the line's value, angular velocity
 
-    def take(self, imu: Array, dt: float, q: list[float], qd: list[float], loaded: list[bool]) -> Stood | None:
+    def take(
+        self, imu: Array, dt: float, q: list[float], qd: list[float], loaded: list[bool]
+    ) -> Stood | None:
         """One reading; what the stand was, at its end.
 
         Args:

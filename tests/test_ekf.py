@@ -110,7 +110,8 @@ def test_an_update_is_kalmans_with_the_feet_it_takes(legs):
         at = slice(3 * k, 3 * k + 3)
         H[at, PHI], H[at, R], H[at, foot(leg)] = -so3.skew(ekf.C @ s[leg]), np.eye(3), -np.eye(3)
         H[3 * len(legs) + k, foot(leg).stop - 1] = 1.0
-    noise = np.repeat([ekf.cfg.kinematics**2, ground], [3 * len(legs), len(legs)])
+    curved = 0.5 * (0.4 * (ekf.P[0, 0] + ekf.P[1, 1])) ** 2
+    noise = np.repeat([ekf.cfg.kinematics**2 + curved, ground], [3 * len(legs), len(legs)])
     S = H @ ekf.P @ H.T + np.diag(noise)
     K = ekf.P @ H.T @ np.linalg.inv(S)
     other = plus(ekf, K @ e)
@@ -139,7 +140,7 @@ def test_feet_that_drift_apart_tell_of_their_creep():
         ekf.innovation((0, 1), s.tolist())
         ekf.correct(None)
     assert ekf.creep == pytest.approx(creep, abs=1e-5)
-    assert math.sqrt(ekf.P[CREEP, CREEP]) < 1e-4
+    assert math.sqrt(ekf.P[CREEP, CREEP]) < 0.2 * ekf.cfg.creep
     np.testing.assert_allclose(ekf.v, 0.0, atol=1e-4)
 
 
@@ -147,16 +148,16 @@ def test_a_late_gyroscope_is_set_right():
     """A swing about one axis, w = 3 sin(10 t), read 1 ms late: the angle is that of now."""
     right, wrong, dt, lag = Ekf(NoiseCfg()), Ekf(NoiseCfg()), 0.002, 0.001
     right.late, last = lag, 0.0
-    for k in range(157):  # a quarter of a turn of the swing: the rate is at its largest
+    for k in range(79):  # until the rate is at its largest, 3 rad/s
         w = np.array([0.3 * (math.cos(10 * (k * dt - lag)) - math.cos(10 * ((k + 1) * dt - lag))) / dt, 0, 0])
         w[0] = 0.0 if k == 0 else w[0]
         for ekf in (right, wrong):
             ekf.predict(w, -DOWN, NO_TURN, dt, change=w - last)
         last = w.copy()
-    angle = 0.3 * (1.0 - math.cos(10 * 157 * dt))
+    angle = 0.3 * (1.0 - math.cos(10 * 79 * dt))
     found, lagging = (so3.log(ekf.q)[0] for ekf in (right, wrong))
     assert abs(found - angle) < 2e-4
-    assert abs(lagging - angle) < 2e-4 or lagging < angle
+    assert lagging - angle == pytest.approx(-3.0 * lag, abs=2e-4)
 
 
 def test_a_thrown_body_flies_a_parabola():
@@ -261,7 +262,9 @@ def test_covariance_stays_symmetric_and_positive():
     ekf, rng = Ekf(NoiseCfg()), np.random.default_rng(6)
     s = np.array([[0.2, 0.15, -0.3], [0.2, -0.15, -0.3], [-0.2, 0.15, -0.3], [-0.2, -0.15, -0.3]])
     for k in range(1000):
-        ekf.predict(rng.normal(size=3), rng.normal(size=3) - DOWN, (0.01 * rng.normal(size=(4, 3))).tolist(), 0.002)
+        ekf.predict(
+            rng.normal(size=3), rng.normal(size=3) - DOWN, (0.01 * rng.normal(size=(4, 3))).tolist(), 0.002
+        )
         leg = int(rng.integers(4))
         if k % 20 == 0:
             ekf.release(leg) if ekf.stands[leg] else ekf.anchor(leg, s[leg])
