@@ -314,7 +314,8 @@ class Ekf:
         Returns:
             Squared Mahalanobis distance of each foot's residual 0 - (C s_i + r - p_i).
         """
-        n, H, e = len(legs), self._rows(legs), []
+        e: list[float] = []
+        n, H = len(legs), self._rows(legs)
         C, r, p = self.C.tolist(), self.r.tolist(), self.p.tolist()
         for k, leg in enumerate(legs):
             x, y, z = so3.rotated(C, s[leg])

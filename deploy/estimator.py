@@ -105,7 +105,7 @@ class Estimator:
         """Forget everything; the next readings must come from a still stand."""
         self.ekf = Ekf(self.cfg.noise)
         self.detectors = [FootContact(self.cfg.contact) for _ in range(4)]
-        self.contact = np.zeros(4, dtype=bool)
+        self.contact, self._carried = np.zeros(4, dtype=bool), False
         self._t = self._good = -math.inf  # of the last tick, of the last with an IMU
         self._start = Start(self.cfg.start, self.cfg.noise.gyro)
         self._imu = np.full(6, np.nan)  # of the last good tick
@@ -168,10 +168,13 @@ class Estimator:
 
     def _lies(self, dt: float) -> bool:
         """Whether the body rests on something else than its feet; then its velocity is 0."""
+        if self._carried:
+            self._calm = 0.0
+            return False
         cfg, (x, y, z) = self.cfg, (self._imu[:3] - self.ekf.bw).tolist()
         size = math.sqrt(float(self._imu[3:] @ self._imu[3:]))
         calm = x * x + y * y + z * z < _CALM_RATE**2 and abs(size - GRAVITY) < _CALM_ACC
-        self._calm = self._calm + dt if calm and not self.contact.any() else 0.0
+        self._calm = self._calm + dt if calm else 0.0
         if self._calm < cfg.rest:
             return False
         self.ekf.observe_rest(cfg.rest_speed**2)
@@ -185,7 +188,7 @@ class Estimator:
             base = float(self.ekf.r[2]) - (x * _IMU[0] + y * _IMU[1] + z * _IMU[2])
             self._lowest = base + height if self.cfg.flat else 0.0
         self._ticks += 1
-        return self._fall.update(used, bool(self.contact.any()), self._lowest, dt)
+        return self._fall.update(used, self._carried, self._lowest, dt)
 
     def _readable(self, gyro: Array, acc: Array) -> bool:
         """Whether the IMU's readings are finite and within the sensor's range."""
@@ -274,7 +277,8 @@ class Estimator:
             if not contact[i] or self._refused[i] > cfg.patience:
                 ekf.release(i)
 
-        self._lost = self._lost + dt if any(contact) and not ekf.stands.any() else 0.0
+        self._carried = any(contact)
+        self._lost = self._lost + dt if self._carried and not ekf.stands.any() else 0.0
         if self._lost > cfg.lost:
             ekf.P[V, V] += cfg.lost_speed**2 * _I3
             self._lost = 0.0

@@ -48,8 +48,15 @@ def plus(ekf: Ekf, d: np.ndarray) -> Ekf:
 def minus(a: Ekf, b: Ekf) -> np.ndarray:
     """Error (29,) of filter b if a is true."""
     phi = so3.log(so3.multiply(a.q, b.q * [1, -1, -1, -1]))
-    parts = (phi, a.v - b.v, a.r - b.r, a.bw - b.bw, a.bf - b.bf, (a.p - b.p).reshape(12))
-    parts += ([a.creep - b.creep, a.late - b.late],)
+    parts = (
+        phi,
+        a.v - b.v,
+        a.r - b.r,
+        a.bw - b.bw,
+        a.bf - b.bf,
+        (a.p - b.p).reshape(12),
+        [a.creep - b.creep, a.late - b.late],
+    )
     return np.concatenate(parts)
 
 
@@ -147,7 +154,7 @@ def test_feet_that_drift_apart_tell_of_their_creep():
 def test_a_late_gyroscope_is_set_right():
     """A swing about one axis, w = 3 sin(10 t), read 1 ms late: the angle is that of now."""
     right, wrong, dt, lag = Ekf(NoiseCfg()), Ekf(NoiseCfg()), 0.002, 0.001
-    right.late, last = lag, 0.0
+    right.late, last = lag, np.zeros(3)
     for k in range(79):  # until the rate is at its largest, 3 rad/s
         w = np.array([0.3 * (math.cos(10 * (k * dt - lag)) - math.cos(10 * ((k + 1) * dt - lag))) / dt, 0, 0])
         w[0] = 0.0 if k == 0 else w[0]

@@ -93,7 +93,7 @@ def test_force_is_what_the_joint_torques_balance(poses):
 
 def test_a_leg_level_with_its_hip_tells_no_force_across():
     """Thigh and shank at opposite slopes: the hip's torque of a force across is 0 there."""
-    angle = np.pi / 2 + 0.45 + 0.5 * (kinematics.FOOT_BACK / kinematics.LINK)
+    angle = np.pi / 2 + 0.45 + 0.5 * (0.002 / go2.LINK)
     leg = chains([0.0, angle, -0.9] * 4)[0]
     assert abs(leg.thigh[1]) < 5e-3
     ahead, across, up = leg.force(1.0, 1.0, 1.0)
