@@ -111,6 +111,7 @@ class Fall:
             lowest: height of the body's lowest point above the ground by it [m]; 0 if that is not known.
             dt: since the tick before [s].
         """
-        wrong = not used or lowest < -self.cfg.depth or (contact and lowest > self.cfg.clearance)
-        self._doubt = max(self._doubt + (dt if wrong else -dt), 0.0)
+        # what is no number is not above the ground either
+        right = used and lowest >= -self.cfg.depth and not (contact and lowest > self.cfg.clearance)
+        self._doubt = max(self._doubt + (-dt if right else dt), 0.0)
         return self._doubt > self.cfg.time

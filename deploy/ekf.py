@@ -20,14 +20,14 @@ The error of the attitude is the rotation vector phi with C = exp(phi) C_hat; al
 estimate. With the gyroscope's reading w_m, the accelerometer's f_m, w = w_m - b_w and f = f_m - b_f:
 
 .. math::
-    \dot C = C [w], \quad \dot v = C f + g, \quad \dot r = v, \quad
+    \dot C = C [w + l \dot w], \quad \dot v = C f + g, \quad \dot r = v, \quad
     \dot p_i = \rho \, (C w_i) \times e_z - c \, h_i
 
 where w_i is the angular velocity of shank i in the body frame, rho the radius of its foot, and h_i the
 horizontal force of the ground on it: a foot that rolls on level ground without slipping has its contact point
-at rest, not its centre; one that is pushed sideways creeps. How fast is found out, since the force within a
-stance draws its feet apart or together. The measurement of a foot that stands, with s_i its centre by
-kinematics, seen from the IMU, is
+at rest, not its centre; one that is pushed sideways creeps. How fast is found out, since the forces within a
+stance draw its feet apart or together; so is how late the gyroscope reads, by what a swing leaves. The
+measurement of a foot that stands, with s_i its centre by kinematics, seen from the IMU, is
 
 .. math::
     0 = C s_i + r - p_i
@@ -55,6 +55,7 @@ PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(1
 FEET, CREEP, LATE = slice(15, 27), 27, 28
 GRAVITY = 9.81
 _ARM = 0.4  # m, from the IMU to a foot
+_TINY = 1e-12
 _I3 = np.eye(3)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
 _NO_FORCE = _FIRM = ((0.0, 0.0),) * 4
@@ -73,14 +74,15 @@ def distance(S: list[list[float]], e: Sequence[float], at: int = 0) -> float:
     """
     second, third = S[at + 1], S[at + 2]
     b, d, c, f, g = second[at], second[at + 1], third[at], third[at + 1], third[at + 2]
-    k = math.sqrt(S[at][at])
+    # rounding must not make a root of what is negative: such a foot is far off, and refused
+    k = math.sqrt(max(S[at][at], _TINY))
     m, n = b / k, c / k
-    o = math.sqrt(d - m * m)
+    o = math.sqrt(max(d - m * m, _TINY))
     p = (f - m * n) / o
     x = e[at] / k
     y = (e[at + 1] - m * x) / o
     z = e[at + 2] - n * x - p * y
-    return x * x + y * y + z * z / (g - n * n - p * p)
+    return x * x + y * y + z * z / max(g - n * n - p * p, _TINY)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from deploy.start import Start, StartCfg
 
 _I3 = np.eye(3)
 _UP = np.array([0.0, 0.0, 1.0])
-_ALL: Flags = np.ones(4, dtype=bool)
 _IMU = (float(IMU[0]), float(IMU[1]), float(IMU[2]))
 _LYING = 0.03  # m, of the height of a body that lies: its outline is not all that well known
 _CALM_RATE, _CALM_ACC = 0.1, 0.6  # rad/s, m/s^2: several times the noise of a reading

@@ -96,7 +96,7 @@ def test_a_flight_is_no_fall():
 
 
 def test_a_body_that_floats_on_its_feet_or_sinks_is_lost():
-    for lowest in (0.3, -0.3):
+    for lowest in (0.3, -0.3, math.nan):
         assert any(doubts(Fall(FallCfg()), 1.0, used=True, lowest=lowest))
     assert not any(doubts(Fall(FallCfg()), 1.0, used=True, lowest=0.05))
 

@@ -107,6 +107,12 @@ def test_distance_is_mahalanobis():
         assert distance(S.tolist(), e.tolist(), at) == pytest.approx(expected)
 
 
+def test_a_covariance_that_is_none_refuses():
+    """As rounding may leave it: no error in the control loop, but a foot that is left out."""
+    S = np.diag([1.0, 1.0, -1e-9])
+    assert distance(S.tolist(), [0.0, 0.0, 0.1]) > 1e6
+
+
 @pytest.mark.parametrize("legs", [(0,), (1, 3), (0, 1, 3)])
 def test_an_update_is_kalmans_with_the_feet_it_takes(legs):
     ekf, rng = random_filter(stands=(True,) * 4), np.random.default_rng(2)
