@@ -156,6 +156,9 @@ class Estimator:
         self.ekf.predict(
             imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt), change
         )
+        if not (good or self._carried) and math.isfinite(float(acc.sum())):
+            # a blow beyond the accelerometer's range, and no feet to tell what it did to the velocity
+            self.ekf.P[V, V] += (2.0 * self.cfg.max_acc * dt) ** 2 * _I3
         used = self._feet(leg, tau.tolist(), force.tolist(), known, dt)
         if self._fallen(leg, self._lies(dt) or bool(used.any()), dt):
             self.falls += 1

@@ -157,6 +157,17 @@ def test_a_reading_beyond_the_sensors_range_is_left_out():
     assert np.linalg.norm(e.velocity) < 0.02
 
 
+def test_a_blow_beyond_the_range_in_flight_widens_the_velocity():
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    robot.run(estimator, 0.5)
+    none = {"force": np.zeros(4), "tau": np.zeros(12)}
+    before = robot.run(estimator, 0.02, acc=np.zeros(3), **none)
+    e = robot.run(estimator, DT, acc=np.array([0.0, 0.0, 400.0]), **none)
+    assert math.sqrt(np.trace(before.velocity_covariance())) < 0.05
+    # what it did is missing: 390 m/s^2 for 2 ms, 0.78 m/s
+    assert 0.4 < math.sqrt(e.velocity_covariance()[2, 2]) < 0.8
+
+
 def test_a_stall_widens_the_covariance_and_the_feet_mend_it():
     robot, estimator = stand("footstand", noise=1.0), Estimator()
     before = robot.run(estimator, 0.5)
