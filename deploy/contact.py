@@ -1,4 +1,6 @@
-r"""Which feet carry load: foot force sensors, and joint torques where a sensor is stuck.
+r"""Which feet carry load, and whether an estimate can be true of a body that the ground carries.
+
+Foot force sensors tell the load, and joint torques where a sensor is stuck.
 
 The torques tell the normal force of the ground, legs taken as massless:
 
@@ -76,3 +78,40 @@ class FootContact:
             zero = self._zero + above * min(1.0, dt / cfg.zero_time)
             self._zero = min(max(zero, -cfg.zero_limit), cfg.zero_limit)
         return self.contact
+
+
+@dataclass(frozen=True)
+class FallCfg:
+    """When an estimate counts as lost.
+
+    Attributes:
+        time: for how long, in balance with the time in which all is well [s]; longer than any flight.
+        clearance: of the body's lowest point from the ground, at most, while a foot carries load [m].
+        depth: below the ground, at most [m].
+    """
+
+    time: float = 0.6
+    clearance: float = 0.15
+    depth: float = 0.1
+
+
+class Fall:
+    """Doubt in an estimate: it grows while no foot agrees with it, or while its body would float or sink."""
+
+    def __init__(self, cfg: FallCfg):
+        self.cfg = cfg
+        self._doubt = 0.0
+
+    def update(self, used: bool, contact: bool, lowest: float, dt: float) -> bool:
+        """One tick; whether the estimate is lost.
+
+        Args:
+            used: whether a foot agreed with it.
+            contact: whether a foot carries load.
+            lowest: height of the body's lowest point above the ground by it [m]; 0 if that is not known.
+            dt: since the tick before [s].
+        """
+        # what is no number is not above the ground either
+        right = used and lowest >= -self.cfg.depth and not (contact and lowest > self.cfg.clearance)
+        self._doubt = max(self._doubt + (-dt if right else dt), 0.0)
+        return self._doubt > self.cfg.time

@@ -1,7 +1,7 @@
 r"""Error-state Kalman filter of a legged body: IMU in, feet on the ground as measurements.
 
 Base: M. Bloesch et al., "State estimation for legged robots: consistent fusion of leg kinematics and IMU",
-RSS 2012, with the rotation error taken in the world frame, feet that roll, and the ground's height.
+RSS 2012, with the rotation error taken in the world frame, feet that roll and creep, and the ground's height.
 
 ========== ===== ======================================================== ============
 state      error meaning                                                  unit
@@ -12,18 +12,22 @@ r          6:9   position of the IMU in the world frame                   m
 b_w        9:12  bias of the gyroscope                                    rad/s
 b_f        12:15 bias of the accelerometer                                m/s^2
 p[0..3]    15:27 centres of the four foot spheres in the world frame      m
+c          27    creep of a loaded foot                                   m/s/N
+l          28    how late the gyroscope reads                             s
 ========== ===== ======================================================== ============
 
 The error of the attitude is the rotation vector phi with C = exp(phi) C_hat; all others are true minus
 estimate. With the gyroscope's reading w_m, the accelerometer's f_m, w = w_m - b_w and f = f_m - b_f:
 
 .. math::
-    \dot C = C [w], \quad \dot v = C f + g, \quad \dot r = v, \quad
-    \dot p_i = \rho \, (C w_i) \times e_z
+    \dot C = C [w + l \dot w], \quad \dot v = C f + g, \quad \dot r = v, \quad
+    \dot p_i = \rho \, (C w_i) \times e_z - c \, h_i
 
-where w_i is the angular velocity of shank i in the body frame and rho the radius of its foot: a foot that
-rolls on level ground without slipping has its contact point at rest, not its centre. The measurement of a
-foot that stands, with s_i its centre by kinematics, seen from the IMU, is
+where w_i is the angular velocity of shank i in the body frame, rho the radius of its foot, and h_i the
+horizontal force of the ground on it: a foot that rolls on level ground without slipping has its contact point
+at rest, not its centre; one that is pushed sideways creeps. How fast is found out, since the forces within a
+stance draw its feet apart or together; so is how late the gyroscope reads, by what a swing leaves. The
+measurement of a foot that stands, with s_i its centre by kinematics, seen from the IMU, is
 
 .. math::
     0 = C s_i + r - p_i
@@ -34,6 +38,7 @@ Feet that do not stand are kept out: their covariance is 1 m^2, uncorrelated.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,19 +49,40 @@ from deploy.kinematics import FOOT_RADIUS
 from deploy.so3 import Array, skew
 
 Flags = NDArray[np.bool_]
-N = 27
+Rows = Sequence[Sequence[float]]
+N = 29
 PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
+FEET, CREEP, LATE = slice(15, 27), 27, 28
 GRAVITY = 9.81
+_ARM = 0.4  # m, from the IMU to a foot
+_TINY = 1e-12
 _I3 = np.eye(3)
-_DIAGONAL = np.arange(N)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
-_ROLL = FOOT_RADIUS * _UP  # rows w to rho w x e_z
-_ROWS = np.array([[3 * leg, 3 * leg + 1, 3 * leg + 2, 12 + leg] for leg in range(4)])
+_NO_FORCE = _FIRM = ((0.0, 0.0),) * 4
+_STEADY = np.zeros(3)
 
 
 def foot(leg: int) -> slice:
     """Where the error of a foot's position is."""
     return slice(15 + 3 * leg, 18 + 3 * leg)
+
+
+def distance(S: list[list[float]], e: Sequence[float], at: int = 0) -> float:
+    """Squared Mahalanobis distance e^T S^-1 e of entries at to at + 3, by Cholesky's decomposition.
+
+    In plain numbers: one call of numpy takes as long as all of it.
+    """
+    second, third = S[at + 1], S[at + 2]
+    b, d, c, f, g = second[at], second[at + 1], third[at], third[at + 1], third[at + 2]
+    # rounding must not make a root of what is negative: such a foot is far off, and refused
+    k = math.sqrt(max(S[at][at], _TINY))
+    m, n = b / k, c / k
+    o = math.sqrt(max(d - m * m, _TINY))
+    p = (f - m * n) / o
+    x = e[at] / k
+    y = (e[at + 1] - m * x) / o
+    z = e[at + 2] - n * x - p * y
+    return x * x + y * y + z * z / max(g - n * n - p * p, _TINY)
 
 
 @dataclass(frozen=True)
@@ -76,11 +102,14 @@ class NoiseCfg:
         acc_bias: of the accelerometer's, likewise [m/s^2].
         turn: of the angular acceleration that a gap between readings hides [rad/s^2].
         jerk: of the change of acceleration that it hides [m/s^3].
-        foot: of a standing foot's random walk [m/sqrt(s)]: yielding ground, creep.
+        foot: of a standing foot's random walk [m/sqrt(s)]: yielding ground.
         roll: of the walk that comes with the shank's turning [m/sqrt(rad)]: wrong links and joint zeros,
             feet that are not quite spheres.
-        joint: of a joint angle that changes from reading to reading [rad].
-        kinematics: of a foot's place by kinematics, likewise [m].
+        slide: of the walk that comes with creep, relative to its speed [sqrt(s)].
+        creep: of a foot's creep before the first reading [m/s/N].
+        late: of how late the gyroscope reads [s].
+        creep_walk: of its random walk, per square root of a second.
+        kinematics: of a foot's place by kinematics that changes from reading to reading [m].
         ground: of the ground's height at a foothold [m].
         ground_time: for how long its errors stay the same [s].
     """
@@ -94,10 +123,13 @@ class NoiseCfg:
     acc_bias: float = 0.03
     turn: float = 20.0
     jerk: float = 100.0
-    foot: float = 0.0015
-    roll: float = 0.0045
-    joint: float = 0.002
-    kinematics: float = 0.0005
+    foot: float = 0.0002
+    roll: float = 0.001
+    slide: float = 0.06
+    creep: float = 1e-3
+    late: float = 1e-3
+    creep_walk: float = 3e-4
+    kinematics: float = 0.0003
     ground: float = 0.01
     ground_time: float = 1.0
 
@@ -108,7 +140,8 @@ class Ekf:
     Attributes:
         q: attitude (w, x, y, z), (4,); C its matrix, (3, 3).
         v, r, bw, bf, p: see the module; p is (4, 3).
-        P: covariance of the error, (27, 27).
+        creep, late: c and l of the module.
+        P: covariance of the error, (29, 29).
         stands: which feet are anchored, (4,) bool.
     """
 
@@ -118,86 +151,134 @@ class Ekf:
         self.C = np.eye(3)
         self.v, self.r, self.bw, self.bf = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         self.p = np.zeros((4, 3))
+        self.creep = self.late = 0.0
         self.stands = np.zeros(4, dtype=bool)
         self.P = np.eye(N)
-        self._F, self._Q = np.eye(N), np.zeros(N)
-        # residuals: rows 3 i of foot i's place, then the heights of the four
-        self._e, self._H = np.zeros(16), np.zeros((16, N))
-        self._PHt, self._S = np.zeros((N, 16)), np.zeros((16, 16))
-        for leg in range(4):
-            self._H[3 * leg : 3 * leg + 3, R] = _I3
-            self._H[3 * leg : 3 * leg + 3, foot(leg)] = -_I3
-            self._H[12 + leg, foot(leg).stop - 1] = 1.0
+        self._F, self._still = np.eye(N), np.eye(N)
+        self._FP = np.empty((N, N))
+        self._H: dict[tuple[int, ...], Array] = {}  # by the feet that an update takes
+        self._legs: tuple[int, ...] = ()
+        self._e, self._PHt, self._S = np.empty(0), np.empty(0), np.empty(0)
 
-    def transition(self, w: Array, f: Array, roll: Array, dt: float) -> Array:
-        """Jacobian of the error after a step by the error before it, (27, 27), to first order in dt.
+    def transition(self, f: Array, roll: Rows, pull: Rows, change: Array, dt: float) -> Array:
+        """Jacobian of the error after a step by the error before it, (29, 29), to first order in dt.
 
         Args:
-            w, f: angular velocity [rad/s] and specific force [m/s^2] without their biases, (3,).
-            roll: rotation of each shank in the world frame over the step [rad], (4, 3).
+            f: specific force without its bias, in the body frame [m/s^2], (3,).
+            roll: rotation of each shank in the world frame over the step [rad], 4 of 3.
+            pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
+            change: of the gyroscope's reading over the step [rad/s], (3,).
             dt: [s].
         """
-        F, C = self._F, self.C
-        push = skew(C @ (f * dt))
-        F[PHI, BW] = -dt * C
-        F[V, PHI], F[R, PHI] = -push, (-0.5 * dt) * push
-        F[V, BF], F[R, BF] = -dt * C, (-0.5 * dt * dt) * C
-        F[R, V] = dt * _I3
-        lift = FOOT_RADIUS * self.stands[:, None, None] * _UP
-        F[15:, PHI] = (lift @ skew(roll)).reshape(12, 3)
-        F[15:, BW] = (lift @ (dt * C)).reshape(12, 3)
+        F, back = self._F, self.C * -dt
+        F[PHI, BW] = F[V, BF] = back
+        lag = self.C @ change
+        F[PHI, LATE] = lag
+        lag_x, lag_y, _ = (FOOT_RADIUS * lag).tolist()
+        x, y, z = (back @ f).tolist()
+        F[3, 1], F[3, 2], F[4, 0] = -z, y, z
+        F[4, 2], F[5, 0], F[5, 1] = -x, -y, x
+        F[6, 3] = F[7, 4] = F[8, 5] = dt
+        # the lever of a rolling foot is rho e_z: entry by entry, for most are zero
+        lever = FOOT_RADIUS * back[1::-1]
+        lever[1] *= -1.0
+        for leg, stands in enumerate(self.stands.tolist()):
+            at = 15 + 3 * leg
+            if not stands:
+                F[at : at + 2] = self._still[at : at + 2]
+                continue
+            x, y, z = roll[leg]
+            F[at, 0] = F[at + 1, 1] = -FOOT_RADIUS * z
+            F[at, 2], F[at + 1, 2] = FOOT_RADIUS * x, FOOT_RADIUS * y
+            F[at : at + 2, BW] = lever
+            F[at, LATE], F[at + 1, LATE] = lag_y, -lag_x
+            x, y = pull[leg]
+            F[at, CREEP], F[at + 1, CREEP] = -dt * x, -dt * y
         return F
 
     def predict(
-        self, gyro: Array, acc: Array, turn: Array, dt: float, gap: float = 0.0, jump: Array | None = None
+        self,
+        gyro: Array,
+        acc: Array,
+        turn: Rows,
+        dt: float,
+        gap: float = 0.0,
+        jump: Array | None = None,
+        pull: Rows = _NO_FORCE,
+        loose: Rows = _FIRM,
+        change: Array = _STEADY,
     ) -> None:
         """Move on by dt.
 
         Args:
             gyro, acc: readings over the step [rad/s], [m/s^2], (3,).
-            turn: rotation of each shank relative to the base over the step, in the body frame [rad], (4, 3).
+            turn: rotation of each shank relative to the base over the step, in the body frame [rad], 4 of 3.
             dt: [s].
             gap: how much of dt no reading covers, or for how long none has come [s].
             jump: difference of the readings before and after the gap, gyroscope's then accelerometer's, (6,):
                 what lies between is known to about half of it.
+            pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
+            loose: what a foot's place walks beyond a standing foot's, variance per time [m^2/s], 4 of
+                (horizontal, vertical).
+            change: of the gyroscope's reading since the last step [rad/s], (3,).
         """
         w, f = gyro - self.bw, acc - self.bf
-        phi = w * dt
-        roll = (turn + phi) @ self.C.T
-        F = self.transition(w, f, roll, dt)
-        cfg, Q = self.cfg, self._Q
-        hidden = 0.5 * gap * dt
-        shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
-        Q[PHI] = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
-        Q[V] = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
+        phi = w * dt + self.late * change
+        roll = (phi + turn) @ self.C.T
+        rows = roll.tolist()
+        F = self.transition(f, rows, pull, change, dt)
+        np.matmul(F, self.P, out=self._FP)
+        P = np.matmul(self._FP, F.T)
+        P += P.T
+        P *= 0.5
+        diagonal = P.reshape(-1)[:: N + 1]
+        diagonal += self._walk(w, f, rows, pull, dt, 0.5 * gap * dt, loose)
         if jump is not None:
-            between = (0.5 * gap * jump) ** 2
-            Q[PHI] += between[:3]
-            Q[V] += between[3:]
-        Q[R] = Q[V] * (dt * dt / 3.0)
-        Q[BW], Q[BF] = cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
-        rolled = np.sqrt((roll * roll).sum(1))
-        Q[15:].reshape(4, 3)[:] = (self.stands * (cfg.foot**2 * dt + cfg.roll**2 * rolled))[:, None]
-        P = F @ self.P @ F.T
-        self.P = 0.5 * (P + P.T)
-        self.P[_DIAGONAL, _DIAGONAL] += Q
+            diagonal[:6] += (0.5 * gap * jump) ** 2
+        self.P = P
 
-        first, second = so3.integrals(phi)
-        self.r = self.r + self.v * dt + self.C @ (second @ f) * (dt * dt)
-        self.r[2] -= 0.5 * GRAVITY * dt * dt
-        self.v = self.v + self.C @ (first @ f) * dt
-        self.v[2] -= GRAVITY * dt
-        self.p += self.stands[:, None] * (roll @ _ROLL)
-        self.q = so3.multiply(self.q, so3.quaternion(phi))
-        self.C = so3.matrix(self.q)
+        first, second = so3.carried(phi, f)
+        dv = self.C @ (dt * first)
+        dv[2] -= GRAVITY * dt
+        dr = self.C @ (dt * dt * second)
+        dr[2] -= 0.5 * GRAVITY * dt * dt
+        self.r = self.r + dr + dt * self.v
+        self.v = self.v + dv
+        for leg, stands in enumerate(self.stands.tolist()):
+            if stands:
+                (x, y, _), (a, b), creep = rows[leg], pull[leg], self.creep * dt
+                self.p[leg, 0] += FOOT_RADIUS * y - creep * a
+                self.p[leg, 1] -= FOOT_RADIUS * x + creep * b
+        self.q, self.C = so3.turned(self.q, phi)
 
-    def anchor(self, leg: int, s: Array, noise: Array) -> None:
+    def _walk(
+        self, w: Array, f: Array, roll: Rows, pull: Rows, dt: float, hidden: float, loose: Rows
+    ) -> list[float]:
+        """Diagonal of the step's noise, 29; `hidden` is the time [s^2] in which changes went unseen."""
+        cfg = self.cfg
+        shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
+        speed = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
+        angle = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
+        place, gyro, acc = speed * dt * dt / 3.0, cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
+        slide = (cfg.slide * self.creep) ** 2
+        Q = [angle] * 3 + [speed] * 3 + [place] * 3 + [gyro] * 3 + [acc] * 3
+        for leg, stands in enumerate(self.stands.tolist()):
+            if not stands:
+                Q += (0.0, 0.0, 0.0)
+                continue
+            (x, y, z), (across, down), (a, b) = roll[leg], loose[leg], pull[leg]
+            across += slide * (a * a + b * b)
+            foot = cfg.foot**2 * dt + cfg.roll**2 * math.sqrt(x * x + y * y + z * z)
+            Q += (foot + across * dt, foot + across * dt, foot + down * dt)
+        Q += (cfg.creep_walk**2 * dt, 0.0)
+        return Q
+
+    def anchor(self, leg: int, s: Array) -> None:
         """A foot touches down: its position becomes what kinematics say.
 
         Args:
             leg: 0 to 3.
             s: foot centre from the IMU in the body frame [m], (3,).
-            noise: covariance of C s [m^2], (3, 3).
         """
         self.release(leg)
         arm = self.C @ s
@@ -207,8 +288,16 @@ class Ekf:
         at, P = foot(leg), self.P
         P[at], P[:, at] = rows, rows.T
         block = rows[:, R] - rows[:, PHI] @ skew(arm).T
-        P[at, at] = 0.5 * (block + block.T) + noise
+        P[at, at] = 0.5 * (block + block.T) + self._place_variance() * _I3
         self.stands[leg] = True
+
+    def _place_variance(self) -> float:
+        """Of a foot's place by kinematics, along an axis [m^2].
+
+        What is of second order in the tilt's error, (1/2) phi^2 s, would pass for knowledge of it.
+        """
+        tilt = float(self.P[0, 0] + self.P[1, 1])
+        return self.cfg.kinematics**2 + 0.5 * (_ARM * tilt) ** 2
 
     def release(self, leg: int) -> None:
         """A foot lifts off, or cannot be trusted."""
@@ -217,39 +306,56 @@ class Ekf:
         self.P[at, at] = _I3
         self.stands[leg] = False
 
-    def innovation(self, s: Array, noise: Array) -> tuple[Array, Array]:
-        """What kinematics say of the anchored feet against what the filter does.
+    def innovation(self, legs: tuple[int, ...], s: Rows) -> list[float]:
+        """What kinematics say of some anchored feet against what the filter does.
 
         Args:
-            s: foot centres from the IMU in the body frame [m], (4, 3).
-            noise: their covariances in the world frame [m^2], (4, 3, 3).
+            legs: which.
+            s: centres of all feet from the IMU in the body frame [m], 4 of 3.
 
         Returns:
-            Residual 0 - (C s_i + r - p_i) of each foot [m], (4, 3), and its covariance [m^2], (4, 3, 3).
+            Squared Mahalanobis distance of each foot's residual 0 - (C s_i + r - p_i).
         """
-        arm = s @ self.C.T
-        self._e[:12] = (self.p - self.r - arm).reshape(12)
-        self._e[12:] = FOOT_RADIUS - self.p[:, 2]
-        self._H[:12, PHI] = skew(-arm).reshape(12, 3)
-        np.matmul(self.P, self._H.T, out=self._PHt)
-        np.matmul(self._H, self._PHt, out=self._S)
-        blocks: Array = np.einsum("iaib->iab", self._S[:12, :12].reshape(4, 3, 4, 3))  # a view
-        blocks += noise
-        return self._e[:12].reshape(4, 3), blocks
+        e: list[float] = []
+        n, H = len(legs), self._rows(legs)
+        C, r, p = self.C.tolist(), self.r.tolist(), self.p.tolist()
+        for k, leg in enumerate(legs):
+            x, y, z = so3.rotated(C, s[leg])
+            q = p[leg]
+            e += (q[0] - r[0] - x, q[1] - r[1] - y, q[2] - r[2] - z)
+            H[3 * k, 1], H[3 * k, 2], H[3 * k + 1, 0] = z, -y, -z
+            H[3 * k + 1, 2], H[3 * k + 2, 0], H[3 * k + 2, 1] = x, y, -x
+        e += [FOOT_RADIUS - p[leg][2] for leg in legs]
+        PHt = self.P @ H.T
+        S = H @ PHt
+        S.reshape(-1)[:: 4 * n + 1][: 3 * n] += self._place_variance()
+        self._legs, self._e, self._PHt, self._S = legs, np.array(e), PHt, S
+        cells = S.tolist()
+        return [distance(cells, e, 3 * k) for k in range(n)]
 
-    def correct(self, used: Flags, ground: float | None) -> None:
-        """One update with the last innovation of some feet.
+    def _rows(self, legs: tuple[int, ...]) -> Array:
+        """Jacobian of the residuals of some feet, (4 n, 29): places first, then heights."""
+        if legs not in self._H:
+            n = len(legs)
+            H = np.zeros((4 * n, N))
+            for k, leg in enumerate(legs):
+                H[3 * k : 3 * k + 3, R], H[3 * k : 3 * k + 3, foot(leg)] = _I3, -_I3
+                H[3 * n + k, foot(leg).stop - 1] = 1.0
+            self._H[legs] = H
+        return self._H[legs]
+
+    def correct(self, ground: float | None) -> None:
+        """One update with the last innovation.
 
         Args:
-            used: which, (4,) bool.
             ground: variance of the ground's height under a foot in this update [m^2]; None: unknown.
         """
-        legs = np.flatnonzero(used)
-        rows = _ROWS[legs, : 3 if ground is None else 4].reshape(-1)
+        n = len(self._legs)
+        rows = 3 * n if ground is None else 4 * n
+        S = self._S[:rows, :rows]
         if ground is not None:
-            self._S.reshape(-1)[12 * 17 :: 17] += ground  # on the diagonal
-        S = self._S[rows[:, None], rows]
-        self._update(self._e[rows], self._H[rows], self._PHt[:, rows], S)
+            S.reshape(-1)[:: rows + 1][3 * n :] += ground
+        self._update(self._e[:rows], self._PHt[:, :rows], S)
 
     def observe_force(self, acc: Array, noise: Array) -> None:
         """One update with the mean specific force of a body that stands still: acc = b_f - C^T g.
@@ -263,23 +369,28 @@ class Ekf:
         H[:, PHI] = self.C.T @ (GRAVITY * _UP)
         H[:, BF] = _I3
         PHt = self.P @ H.T
-        self._update(acc - self.bf - up, H, PHt, H @ PHt + np.diag(noise))
+        self._update(acc - self.bf - up, PHt, H @ PHt + np.diag(noise))
 
     def observe_rate(self, gyro: Array, noise: Array) -> None:
         """One update with the mean angular velocity of a body that stands still: gyro = b_w."""
         H = np.zeros((3, N))
         H[:, BW] = _I3
         PHt = self.P @ H.T
-        self._update(gyro - self.bw, H, PHt, H @ PHt + np.diag(noise))
+        self._update(gyro - self.bw, PHt, H @ PHt + np.diag(noise))
 
-    def _update(self, e: Array, H: Array, PHt: Array, S: Array) -> None:
+    def observe_rest(self, variance: float) -> None:
+        """One update with a velocity of 0, of such a variance [m^2/s^2]."""
+        self._update(-self.v, self.P[:, V], self.P[V, V] + variance * _I3)
+
+    def _update(self, e: Array, PHt: Array, S: Array) -> None:
         """Kalman update with residual e = H error + noise, whose covariance is S = H P H^T + noise."""
         K = np.linalg.solve(S, PHt.T).T
         # equal to Joseph's form for this K; what rounding leaves of asymmetry, `predict` takes out
         self.P = self.P - K @ PHt.T
         d = K @ e
-        self.q = so3.multiply(so3.quaternion(d[PHI]), self.q)
-        self.C = so3.matrix(self.q)
+        self.q, self.C = so3.turned(self.q, d[PHI], world=True)
         self.v, self.r = self.v + d[V], self.r + d[R]
         self.bw, self.bf = self.bw + d[BW], self.bf + d[BF]
-        self.p += d[15:].reshape(4, 3)
+        self.p += d[FEET].reshape(4, 3)
+        self.creep += float(d[CREEP])
+        self.late += float(d[LATE])

@@ -8,38 +8,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deploy import so3
-from deploy.contact import ContactCfg, FootContact
-from deploy.ekf import BF, BW, GRAVITY, PHI, Ekf, Flags, NoiseCfg, R, V
+from deploy.contact import ContactCfg, Fall, FallCfg, FootContact
+from deploy.ekf import BF, BW, CREEP, GRAVITY, LATE, PHI, Ekf, Flags, NoiseCfg, R, V, distance
 from deploy.estimate import Estimate
-from deploy.kinematics import FOOT_RADIUS, IMU, Legs, legs
-from deploy.so3 import Array, skew
+from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, lowest
+from deploy.so3 import Array
+from deploy.start import Start, StartCfg
 
 _I3 = np.eye(3)
 _UP = np.array([0.0, 0.0, 1.0])
-_ALL: Flags = np.ones(4, dtype=bool)
-# rows w to rows -rho w x e_z
-_LEVER = FOOT_RADIUS * skew(_UP).T
-
-
-@dataclass(frozen=True)
-class StartCfg:
-    """The still stand at the start.
-
-    Attributes:
-        time: its length [s].
-        speed: of the body then, standard deviation [m/s].
-        rate: mean angular velocity, likewise [rad/s].
-        acc: mean acceleration, likewise [m/s^2].
-        max_rate: mean angular speed beyond which the robot is not standing still [rad/s].
-        max_acc: difference of the mean specific force from gravity, likewise [m/s^2].
-    """
-
-    time: float = 0.25
-    speed: float = 0.1
-    rate: float = 0.005
-    acc: float = 0.2
-    max_rate: float = 0.5
-    max_acc: float = 2.0
+_IMU = (float(IMU[0]), float(IMU[1]), float(IMU[2]))
+_LYING = 0.03  # m, of the height of a body that lies: its outline is not all that well known
+_CALM_RATE, _CALM_ACC = 0.1, 0.6  # rad/s, m/s^2: several times the noise of a reading
+_SELDOM = 10  # ticks from one look at the body's height to the next
+_ARM = 0.3  # m, of a joint about the foot: a stance's leg is between 0.2 and 0.42 long
 
 
 @dataclass(frozen=True)
@@ -49,7 +31,8 @@ class EstimatorCfg:
     Attributes:
         noise: standard deviations.
         contact: contact detection.
-        start: the still stand at the start.
+        start: the stand at the start.
+        fall: when the estimate counts as lost.
         flat: whether all footholds are at height 0, which keeps the height from drifting.
         period: of the readings [s]; longer steps have a gap that no reading covers.
         max_gap: without readings for longer, the estimator starts anew [s].
@@ -58,9 +41,15 @@ class EstimatorCfg:
         slip_gate: the same for the speed of a foot's contact point.
         creep: speed at which the contact point of a standing foot may move, standard deviation [m/s].
         joint_speed: standard deviation of a reading [rad/s].
+        settle: horizontal speed that a foot has left when it begins to count as standing, likewise [m/s].
+        settle_time: in which it goes down to 1/e [s].
+        bounce: vertical speed with which a foot comes back out of ground that it has hit, of that of the hit.
+        bounce_time: in which it goes down to 1/e [s].
         patience: a foot left out for longer loses its anchor [s].
         lost: when all feet with contact are left out for this long, the velocity counts as lost [s].
         lost_speed: standard deviation added to it then [m/s].
+        rest: a body that neither turns nor accelerates for so long, without a foot on the ground, lies [s].
+        rest_speed: of such a body, standard deviation [m/s].
         max_gyro: range of the gyroscope, 2000 deg/s [rad/s].
         max_acc: range of the accelerometer, 16 g [m/s^2].
     """
@@ -68,6 +57,7 @@ class EstimatorCfg:
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     contact: ContactCfg = field(default_factory=ContactCfg)
     start: StartCfg = field(default_factory=StartCfg)
+    fall: FallCfg = field(default_factory=FallCfg)
     flat: bool = True
     period: float = 0.002
     max_gap: float = 0.5
@@ -75,9 +65,15 @@ class EstimatorCfg:
     slip_gate: float = 16.3
     creep: float = 0.035
     joint_speed: float = 0.05
+    settle: float = 0.1
+    settle_time: float = 0.01
+    bounce: float = 0.2
+    bounce_time: float = 0.025
     patience: float = 0.01
     lost: float = 0.05
     lost_speed: float = 0.5
+    rest: float = 0.2
+    rest_speed: float = 0.03
     max_gyro: float = 35.0
     max_acc: float = 157.0
 
@@ -85,9 +81,9 @@ class EstimatorCfg:
 class Estimator:
     """Body state of the Go2 from IMU, joint encoders, joint torques and foot forces.
 
-    It begins with a still stand at any attitude, on two feet or four: the mean specific force gives the
-    gravity direction, the mean angular velocity the gyroscope's bias, both with honest covariances. The
-    heading there is 0, and x and y are 0.
+    It begins with a stand at any attitude, on two feet or four, or with a body that lies still: they give
+    gravity direction, velocity, height and the gyroscope's bias, with honest covariances (`deploy.start`).
+    The heading there is 0, and x and y are 0. After a fall that it cannot follow it begins anew by itself.
 
     Args:
         cfg: settings.
@@ -96,31 +92,36 @@ class Estimator:
         ekf: the Kalman ekf.
         detectors: contact detection of each foot.
         contact: what it says, (4,) bool.
+        falls: how often the estimate was lost and begun anew.
     """
 
     def __init__(self, cfg: EstimatorCfg | None = None):
         self.cfg = cfg or EstimatorCfg()
+        self.falls = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget everything; the next readings must come from a still stand."""
         self.ekf = Ekf(self.cfg.noise)
         self.detectors = [FootContact(self.cfg.contact) for _ in range(4)]
-        self.contact = np.zeros(4, dtype=bool)
+        self.contact, self._carried = np.zeros(4, dtype=bool), False
         self._t = self._good = -math.inf  # of the last tick, of the last with an IMU
-        self._still: list[Array] = []
+        self._start = Start(self.cfg.start, self.cfg.noise.gyro)
         self._imu = np.full(6, np.nan)  # of the last good tick
-        self._q, self._qd = np.full((4, 3), np.nan), np.zeros((4, 3))
-        self._refused = np.zeros(4)  # for how long each foot has been left out [s]
-        self._lost = 0.0
-        self._A, self._b = np.zeros((3, 4, 3, 3)), np.zeros((3, 4, 3))
+        self._q, self._qd = [math.nan] * 12, [0.0] * 12
+        self._refused = [0.0] * 4  # for how long each foot has been left out [s]
+        self._lost = self._calm = 0.0
+        self._pull = [(0.0, 0.0)] * 4  # horizontal force on each foot with contact [N]
+        # variance of the speed of each foot since it touched down, horizontal and vertical [m^2/s^2]
+        self._moves = [(0.0, 0.0)] * 4
+        self._fall, self._ticks, self._lowest = Fall(self.cfg.fall), 0, 0.0
         self._ready = False
         self._estimate: Estimate | None = None
 
     def update(
         self, t: float, gyro: Array, acc: Array, q: Array, qd: Array, tau: Array, force: Array
     ) -> Estimate | None:
-        """Take one tick's readings; None until the still stand at the start is over.
+        """Take one tick's readings; None until the stand at the start is over, and again after a fall.
 
         A tick that is not newer than the last changes nothing. Readings that are not finite, or out of the
         sensor's range, count as missing: the motion goes on as before, and feet with missing joints wait.
@@ -140,127 +141,210 @@ class Estimator:
         last, good, blind = self._imu, self._readable(gyro, acc), t - self._good
         if good:
             self._imu, self._good, blind = np.concatenate([gyro, acc]), t, blind - self.cfg.period
-        angles, speeds = q.reshape(4, 3), qd.reshape(4, 3)
-        if math.isfinite(angles.sum() + speeds.sum()):
-            known, turned = _ALL, angles - self._q
-            self._q, self._qd = angles.copy(), speeds.copy()
-        else:
-            known = np.asarray(np.isfinite(angles + speeds).all(1))
-            turned = np.where(known[:, None], angles - self._q, 0.0)
-            self._q = np.where(known[:, None], angles, self._q)
-            self._qd = np.where(known[:, None], speeds, self._qd)
+        known, turned = self._joints(q.tolist(), qd.tolist())
         if not self._ready:
-            self._start(good)
+            self._begin(good, force.tolist(), dt)
             return self._estimate
 
-        leg = legs(self._q.reshape(12))
-        imu, jump = self._imu, None
+        leg = chains(self._q)
+        imu, jump, change = self._imu, None, self._imu[:3] - last[:3]
         if good and blind > 0.1 * self.cfg.period:
             # the gap gets the mean of the readings around it, the rest of the step its own
             jump = imu - last
             imu = imu - 0.5 * min(1.0, blind / dt) * jump
-        turn = (leg.axis @ turned[:, :, None])[:, :, 0]
-        self.ekf.predict(imu[:3], imu[3:], turn, dt, max(0.0, blind), jump)
-        used = self._feet(leg, tau, force, known, dt)
+        turns = [chain.shank(*turned[3 * i : 3 * i + 3]) for i, chain in enumerate(leg)]
+        self.ekf.predict(
+            imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt), change
+        )
+        if not (good or self._carried) and math.isfinite(float(acc.sum())):
+            # a blow beyond the accelerometer's range, and no feet to tell what it did to the velocity
+            self.ekf.P[V, V] += (2.0 * self.cfg.max_acc * dt) ** 2 * _I3
+        used = self._feet(leg, tau.tolist(), force.tolist(), known, dt)
+        if self._fallen(leg, self._lies(dt) or bool(used.any()), dt):
+            self.falls += 1
+            self.reset()
+            self._t = self._good = t
+            return None
         self._estimate = self._output(used)
         return self._estimate
+
+    def _lies(self, dt: float) -> bool:
+        """Whether the body rests on something else than its feet; then its velocity is 0."""
+        if self._carried:
+            self._calm = 0.0
+            return False
+        cfg, (x, y, z) = self.cfg, (self._imu[:3] - self.ekf.bw).tolist()
+        size = math.sqrt(float(self._imu[3:] @ self._imu[3:]))
+        calm = x * x + y * y + z * z < _CALM_RATE**2 and abs(size - GRAVITY) < _CALM_ACC
+        self._calm = self._calm + dt if calm else 0.0
+        if self._calm < cfg.rest:
+            return False
+        self.ekf.observe_rest(cfg.rest_speed**2)
+        return True
+
+    def _fallen(self, leg: list[Chain], used: bool, dt: float) -> bool:
+        """Whether the estimate has lost the robot."""
+        if self._ticks % _SELDOM == 0:
+            x, y, z = up = self.ekf.C[2].tolist()
+            height, _ = lowest(leg, self._q, up)
+            base = float(self.ekf.r[2]) - (x * _IMU[0] + y * _IMU[1] + z * _IMU[2])
+            self._lowest = base + height if self.cfg.flat else 0.0
+        self._ticks += 1
+        return self._fall.update(used, self._carried, self._lowest, dt)
 
     def _readable(self, gyro: Array, acc: Array) -> bool:
         """Whether the IMU's readings are finite and within the sensor's range."""
         cfg = self.cfg
         # comparisons with NaN are false
-        return bool(np.abs(gyro).max() < cfg.max_gyro and np.abs(acc).max() < cfg.max_acc)
+        return all(abs(w) < cfg.max_gyro for w in gyro.tolist()) and all(
+            abs(f) < cfg.max_acc for f in acc.tolist()
+        )
 
-    def _start(self, good: bool) -> None:
-        """Collect the still stand; at its end, set the filter."""
-        cfg, ekf = self.cfg.start, self.ekf
-        if good and np.isfinite(self._q).all():
-            self._still.append(self._imu)
-        if len(self._still) * self.cfg.period < cfg.time:
+    def _joints(self, q: list[float], qd: list[float]) -> tuple[list[bool], list[float]]:
+        """Take the joints' readings; which legs have all of theirs, and how far each joint turned [rad]."""
+        known = [True] * 4
+        if not math.isfinite(sum(q) + sum(qd)):
+            for i in range(4):
+                at = slice(3 * i, 3 * i + 3)
+                known[i] = math.isfinite(sum(q[at]) + sum(qd[at]))
+                if not known[i]:
+                    q[at], qd[at] = self._q[at], self._qd[at]
+        turned = [new - old for new, old in zip(q, self._q, strict=True)]
+        self._q, self._qd = q, qd
+        return known, turned
+
+    def _begin(self, good: bool, force: list[float], dt: float) -> None:
+        """Collect the stand at the start; at its end, set the filter."""
+        if not (good and math.isfinite(sum(self._q))):
             return
-        readings = np.array(self._still)
-        self._still = []
-        mean, spread = readings.mean(0), readings.var(0)
-        size = float(np.linalg.norm(mean[3:]))
-        if np.linalg.norm(mean[:3]) > cfg.max_rate or abs(size - GRAVITY) > cfg.max_acc:
+        loaded = [f > self.cfg.contact.on for f in force]
+        stood = self._start.take(
+            self._imu, dt if dt < self.cfg.max_gap else self.cfg.period, self._q, self._qd, loaded
+        )
+        if stood is None:
             return
-        ekf.q = so3.aligning(mean[3:] / size, _UP)
+        ekf, noise = self.ekf, self.cfg.noise
+        ekf.q = so3.aligning(stood.force / np.linalg.norm(stood.force), _UP)
         ekf.C = so3.matrix(ekf.q)
-        arms = (legs(self._q.reshape(12)).foot - IMU) @ ekf.C[2]
-        ekf.r[2] = FOOT_RADIUS - arms.min()
+        height, foot = lowest(chains(self._q), self._q, ekf.C[2].tolist())
+        ekf.r[2], ekf.v = float(ekf.C[2] @ IMU) - height, ekf.C @ stood.velocity
 
         # all but unknown before the update with the mean specific force, which ties the tilt to the bias
-        noise, variance = self.cfg.noise, np.ones(len(ekf.P))
-        variance[PHI], variance[V] = (1.0, 1.0, 1e-8), cfg.speed**2
-        variance[R] = 1e-8, 1e-8, noise.ground**2
+        variance = np.ones(len(ekf.P))
+        variance[PHI], variance[V] = (1.0, 1.0, 1e-8), stood.velocity_error**2
+        variance[R] = 1e-8, 1e-8, noise.ground**2 if foot else _LYING**2
         variance[BW], variance[BF] = noise.gyro_bias**2, noise.acc_bias**2
+        variance[CREEP], variance[LATE] = noise.creep**2, noise.late**2
         ekf.P = np.diag(variance)
-        white = np.repeat([noise.gyro**2, noise.acc**2], 3)
-        sway = np.repeat([cfg.rate**2, cfg.acc**2], 3)
-        # what moves more than noise is a stand that sways, slower than the mean could tell
-        error = white / len(readings) + 4.0 * np.maximum(spread - white, 0.0) + sway
-        ekf.observe_rate(mean[:3], error[:3])
-        ekf.observe_force(mean[3:], error[3:])
+        ekf.observe_rate(stood.rate, stood.rate_variance)
+        ekf.observe_force(stood.force, np.full(3, stood.force_error**2))
         self._ready = True
 
-    def _feet(self, leg: Legs, tau: Array, force: Array, known: Flags, dt: float) -> Flags:
+    def _feet(
+        self, leg: list[Chain], tau: list[float], force: list[float], known: list[bool], dt: float
+    ) -> Flags:
         """Tell contacts, use feet, anchor and release them; which were used, (4,) bool."""
         cfg, ekf = self.cfg, self.ekf
-        s, spread = leg.foot - IMU, ekf.C @ leg.jacobian
-        gram = spread @ spread.transpose(0, 2, 1)
-        noise = cfg.noise.joint**2 * gram + cfg.noise.kinematics**2 * _I3
-        # three systems a foot, solved at once: its place, its contact point's velocity, its force
-        A, b = self._A, self._b
-        b[0], A[0] = ekf.innovation(s, noise)
-        b[1], A[1] = self._slip(leg, s), cfg.joint_speed**2 * gram + (ekf.P[V, V] + cfg.creep**2 * _I3)
-        b[2], A[2] = tau.reshape(4, 3), leg.jacobian.transpose(0, 2, 1)
-        x = np.linalg.solve(A, b[..., None])[..., 0]
-        place, speed = (b[:2] * x[:2]).sum(2)
-        readings = zip(self.detectors, force.tolist(), (x[2] @ -ekf.C[2]).tolist(), strict=True)
-        self.contact = contact = np.array([foot.update(f, load, dt) for foot, f, load in readings])
+        C, contact, still = ekf.C.tolist(), [False] * 4, [False] * 4
+        for i, chain in enumerate(leg):
+            x, y, z = so3.rotated(C, chain.force(*tau[3 * i : 3 * i + 3]))
+            contact[i] = self.detectors[i].update(force[i], z, dt)
+            if not contact[i]:
+                continue
+            self._pull[i] = (x, y) if math.isfinite(x + y) else (0.0, 0.0)
+            u = self._slip(i, chain, C)
+            if not self.contact[i]:
+                self._moves[i] = cfg.settle**2, (cfg.bounce * min(u[2], 0.0)) ** 2
+            still[i] = known[i] and self._rests(i, u)
 
-        still = contact & known & (speed < cfg.slip_gate)
-        used: Flags = ekf.stands & still & (place < cfg.gate)
-        if used.any():
-            ekf.correct(used, cfg.noise.ground**2 * cfg.noise.ground_time / dt if cfg.flat else None)
+        stands, used = ekf.stands.tolist(), np.zeros(4, dtype=bool)
+        s = [(x - _IMU[0], y - _IMU[1], z - _IMU[2]) for x, y, z in (chain.foot for chain in leg)]
+        legs = tuple(i for i in range(4) if still[i] and stands[i])
+        if legs:
+            far = ekf.innovation(legs, s)
+            if max(far) > cfg.gate:
+                legs = tuple(i for i, place in zip(legs, far, strict=True) if place < cfg.gate)
+                if legs:
+                    ekf.innovation(legs, s)
+            if legs:
+                ekf.correct(cfg.noise.ground**2 * cfg.noise.ground_time / dt if cfg.flat else None)
+                used[list(legs)] = True
         for i in range(4):
-            if not ekf.stands[i]:
+            if not stands[i]:
                 self._refused[i] = 0.0
                 if still[i]:
-                    ekf.anchor(i, s[i], noise[i])
+                    ekf.anchor(i, np.array(s[i]))
                 continue
             self._refused[i] = 0.0 if used[i] else self._refused[i] + dt
             if not contact[i] or self._refused[i] > cfg.patience:
                 ekf.release(i)
 
-        self._lost = self._lost + dt if contact.any() and not ekf.stands.any() else 0.0
+        self._carried = any(contact)
+        self._lost = self._lost + dt if self._carried and not ekf.stands.any() else 0.0
         if self._lost > cfg.lost:
             ekf.P[V, V] += cfg.lost_speed**2 * _I3
             self._lost = 0.0
+        self.contact = np.array(contact)
         return used
 
-    def _slip(self, leg: Legs, s: Array) -> Array:
-        r"""Velocity of each foot's contact point in the world frame [m/s], (4, 3).
+    def _loose(self, dt: float) -> list[tuple[float, float]]:
+        """What the feet walk since they touched down: they slide, sink in and come back [m^2/s]."""
+        cfg = self.cfg
+        slower = math.exp(-2.0 * dt / cfg.settle_time), math.exp(-2.0 * dt / cfg.bounce_time)
+        self._moves = [(across * slower[0], down * slower[1]) for across, down in self._moves]
+        return [(across * cfg.settle_time, down * cfg.bounce_time) for across, down in self._moves]
 
-        .. math:: u_i = v + C (w \times s_i + J_i \dot q_i) - \rho \, (C w_i) \times e_z
+    def _slip(self, i: int, chain: Chain, C: list[list[float]]) -> Vector:
+        r"""Velocity of a foot's contact point in the world frame [m/s].
+
+        .. math:: u_i = v + C (w \times s_i + J_i \dot q_i) - \rho \, (C w_i) \times e_z + c \, h_i
         """
-        C, qd = self.ekf.C, self._qd[:, :, None]
-        w = self._imu[:3] - self.ekf.bw
-        rel = s @ skew(w).T + (leg.jacobian @ qd)[:, :, 0]
-        shank = w + (leg.axis @ qd)[:, :, 0]
-        return np.asarray(self.ekf.v + rel @ C.T + shank @ (C.T @ _LEVER))
+        ekf, (a, b, c) = self.ekf, self._qd[3 * i : 3 * i + 3]
+        p, q, r = (self._imu[:3] - ekf.bw).tolist()
+        x, y, z = chain.foot
+        x, y, z = x - _IMU[0], y - _IMU[1], z - _IMU[2]
+        j, k, m = chain.rows
+        foot = so3.rotated(
+            C,
+            (
+                q * z - r * y + j[0] * a + j[1] * b + j[2] * c,
+                r * x - p * z + k[0] * a + k[1] * b + k[2] * c,
+                p * y - q * x + m[0] * a + m[1] * b + m[2] * c,
+            ),
+        )
+        d, e, f = chain.shank(a, b, c)
+        d, e, _ = so3.rotated(C, (p + d, q + e, r + f))
+        vx, vy, vz = ekf.v.tolist()
+        x, y = self._pull[i]
+        return (
+            vx + foot[0] - FOOT_RADIUS * e + ekf.creep * x,
+            vy + foot[1] + FOOT_RADIUS * d + ekf.creep * y,
+            vz + foot[2],
+        )
+
+    def _rests(self, i: int, u: Vector) -> bool:
+        """Whether the contact point of a foot with contact rests, by its velocity u [m/s]."""
+        cfg, P, (x, y) = self.cfg, self.ekf.P, self._pull[i]
+        A, doubt = P[V, V].tolist(), float(P[CREEP, CREEP])
+        noise = cfg.creep**2 + (cfg.joint_speed * _ARM) ** 2
+        A[0][0] += noise + doubt * x * x
+        A[1][1] += noise + doubt * y * y
+        A[2][2] += noise + self._moves[i][1]
+        return distance(A, u) < cfg.slip_gate
 
     def _output(self, used: Flags) -> Estimate:
         """The estimate of the base, from that of the IMU."""
-        ekf, x = self.ekf, np.empty(37)
+        ekf = self.ekf
         w = self._imu[:3] - ekf.bw
-        x[:3] = ekf.r - ekf.C @ IMU
-        x[3:7], x[7:19] = ekf.q, self._q.reshape(12)
-        x[19:22] = ekf.v - ekf.C @ (skew(w) @ IMU)
-        x[22:25], x[25:] = w, self._qd.reshape(12)
+        a, b, c = w.tolist()
+        x, y, z = _IMU
+        arm = np.array([(x, b * z - c * y), (y, c * x - a * z), (z, a * y - b * x)])
+        base = ekf.C @ arm  # the IMU and its velocity, seen from the base
+        place, velocity = ekf.r - base[:, 0], ekf.v - base[:, 1]
+        state = [*place.tolist(), *ekf.q.tolist(), *self._q, *velocity.tolist(), a, b, c, *self._qd]
         return Estimate(
             self._t,
-            x,
+            np.array(state),
             ekf.C,
             ekf.bw,
             ekf.bf,

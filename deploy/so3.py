@@ -7,6 +7,7 @@ for the error-state Kalman filter", 2017, sections 2 to 4, with the Hamilton con
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +28,24 @@ def skew(a: Array) -> Array:
     return (a @ _SKEW).reshape(*a.shape, 3)
 
 
+def rotated(C: list[list[float]], a: Sequence[float]) -> tuple[float, float, float]:
+    """C a of a matrix (3, 3) and a vector in plain numbers."""
+    x, y, z = a
+    (b, c, d), (e, f, g), (h, i, j) = C
+    return b * x + c * y + d * z, e * x + f * y + g * z, h * x + i * y + j * z
+
+
 def matrix(q: Array) -> Array:
     """Rotation matrix (3, 3) of a unit quaternion (4,)."""
     w, x, y, z = q.tolist()
+    # one row of nine: numpy reads nested lists more slowly
     return np.array(
         [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
         ]
-    )
+    ).reshape(3, 3)
 
 
 def multiply(p: Array, q: Array) -> Array:
@@ -67,6 +76,28 @@ def exp(phi: Array) -> Array:
     return matrix(quaternion(phi))
 
 
+def turned(q: Array, phi: Array, world: bool = False) -> tuple[Array, Array]:
+    """Unit quaternion (4,) and matrix (3, 3) of q turned on by phi [rad] in the body's or the world's frame.
+
+    The same as `quaternion`, `multiply` and `matrix` in turn, without the arrays between them.
+    """
+    x, y, z = phi.tolist()
+    a, b, c, d = q.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    s = math.sin(0.5 * angle) / angle if angle > _SMALL else 0.5 - angle * angle / 48.0
+    t, x, y, z = math.cos(0.5 * angle), s * x, s * y, s * z
+    if world:  # the vector parts' product changes its sign with the order
+        b, c, d, x, y, z = x, y, z, b, c, d
+        a, t = t, a
+    e = a * t - b * x - c * y - d * z
+    f = a * x + b * t + c * z - d * y
+    g = a * y - b * z + c * t + d * x
+    h = a * z + b * y - c * x + d * t
+    s = 1.0 / math.sqrt(e * e + f * f + g * g + h * h)
+    out = np.array([s * e, s * f, s * g, s * h])
+    return out, matrix(out)
+
+
 def log(q: Array) -> Array:
     """Rotation vector [rad] (3,), no longer than pi, of a unit quaternion (4,)."""
     w, x, y, z = q.tolist()
@@ -88,15 +119,37 @@ def integrals(phi: Array) -> tuple[Array, Array]:
     """
     K = skew(phi)
     K2 = K @ K
-    square = float(phi @ phi)
-    if square < _SMALL * _SMALL:
-        a, b, c = 0.5, 1.0 / 6.0, 1.0 / 24.0
-    else:
-        angle = math.sqrt(square)
-        a = (1.0 - math.cos(angle)) / square
-        b = (angle - math.sin(angle)) / (square * angle)
-        c = (0.5 - a) / square
+    a, b, c = _coefficients(float(phi @ phi))
     return _EYE + a * K + b * K2, 0.5 * _EYE + b * K + c * K2
+
+
+def carried(phi: Array, f: Array) -> tuple[Array, Array]:
+    """Both `integrals` of phi (3,) times f (3,), without the matrices: (3,) each."""
+    (x, y, z), (a, b, c) = phi.tolist(), f.tolist()
+    square = x * x + y * y + z * z
+    first, second, third = _coefficients(square)
+    # phi x f, and phi x (phi x f)
+    p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
+    u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
+    return (
+        np.array([a + first * p + second * u, b + first * q + second * v, c + first * r + second * w]),
+        np.array(
+            [
+                0.5 * a + second * p + third * u,
+                0.5 * b + second * q + third * v,
+                0.5 * c + second * r + third * w,
+            ]
+        ),
+    )
+
+
+def _coefficients(square: float) -> tuple[float, float, float]:
+    """Of the powers of a skew matrix in its integrals, by its squared angle."""
+    if square < _SMALL * _SMALL:
+        return 0.5, 1.0 / 6.0, 1.0 / 24.0
+    angle = math.sqrt(square)
+    first = (1.0 - math.cos(angle)) / square
+    return first, (angle - math.sin(angle)) / (square * angle), (0.5 - first) / square
 
 
 def aligning(a: Array, b: Array) -> Array:

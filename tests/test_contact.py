@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from deploy.contact import ContactCfg, FootContact
+from deploy.contact import ContactCfg, Fall, FallCfg, FootContact
 
 DT = 0.002
 CFG = ContactCfg()
@@ -76,3 +76,31 @@ def test_no_reading_leaves_it_to_the_torques():
     assert foot.update(math.nan, 75.0, DT)
     assert not foot.update(math.nan, 0.0, DT)
     assert foot.update(75.0, 75.0, DT)
+
+
+def doubts(fall: Fall, seconds: float, used: bool, contact: bool = True, lowest: float = 0.0) -> list[bool]:
+    return [fall.update(used, contact, lowest, DT) for _ in range(round(seconds / DT))]
+
+
+def test_an_estimate_is_lost_when_no_foot_agrees_for_long():
+    fall, time = Fall(FallCfg()), FallCfg().time
+    assert not any(doubts(fall, time - 2 * DT, used=False))
+    assert any(doubts(fall, 4 * DT, used=False))
+
+
+def test_a_flight_is_no_fall():
+    fall = Fall(FallCfg())
+    assert not any(doubts(fall, 0.5, used=False, contact=False, lowest=0.4))
+    assert not any(doubts(fall, 0.5, used=True))
+    assert not any(doubts(fall, 0.5, used=False, contact=False, lowest=0.4))
+
+
+def test_a_body_that_floats_on_its_feet_or_sinks_is_lost():
+    for lowest in (0.3, -0.3, math.nan):
+        assert any(doubts(Fall(FallCfg()), 1.0, used=True, lowest=lowest))
+    assert not any(doubts(Fall(FallCfg()), 1.0, used=True, lowest=0.05))
+
+
+def test_feet_that_agree_half_of_the_time_do_not_lose_the_estimate():
+    fall = Fall(FallCfg())
+    assert not any(fall.update(k % 2 == 0, True, 0.0, DT) for k in range(2000))

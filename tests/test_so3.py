@@ -75,3 +75,27 @@ def test_aligning_turns_one_vector_into_the_other():
         q = so3.aligning(a, up)
         assert np.linalg.norm(q) == pytest.approx(1.0)
         np.testing.assert_allclose(so3.matrix(q) @ a, up, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_turned_is_a_product_of_quaternions(angle):
+    q, phi = so3.quaternion(vector(2.0)), vector(angle)
+    for world, expected in (
+        (False, so3.multiply(q, so3.quaternion(phi))),
+        (True, so3.multiply(so3.quaternion(phi), q)),
+    ):
+        found, C = so3.turned(q, phi, world)
+        np.testing.assert_allclose(found, expected, atol=1e-15)
+        np.testing.assert_allclose(C, so3.matrix(expected), atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 9.9e-4, 1.01e-3, 0.02, 1.0, 3.0])
+def test_carried_is_the_integrals_times_a_vector(angle):
+    phi, f = vector(angle), RNG.normal(size=3)
+    for found, matrix in zip(so3.carried(phi, f), so3.integrals(phi), strict=True):
+        np.testing.assert_allclose(found, matrix @ f, atol=1e-14)
+
+
+def test_rotated_is_the_product_of_matrix_and_vector():
+    C, a = RNG.normal(size=(3, 3)), RNG.normal(size=3)
+    np.testing.assert_allclose(so3.rotated(C.tolist(), a.tolist()), C @ a, atol=1e-15)

@@ -93,6 +93,7 @@ def summarise(scores: Sequence[Score], motion: str, name: str) -> dict[str, Any]
     row["us"] = float(np.median([score.us for score in rows]))
     if name == "ours":
         row["rejected"] = float(np.mean([score.rejected for score in rows]))
+        row["falls"] = sum(score.falls for score in rows)
         row["used_slip"] = float(np.mean([score.used_slip for score in rows]))
         for i, (part, freedom) in enumerate(NEES.items()):
             row[f"nees_{part}"] = float(np.mean([score.nees[i] for score in rows]))
@@ -104,14 +105,22 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     """A row a motion and filter."""
     view = Table(title="body state from the robot's own sensors")
     heads = ("motion", "filter", "seeds", "velocity RMSE [m/s]", "worst [m/s]", "tilt RMSE [deg]")
-    for head in (*heads, "height, end [mm]", "rejected [%]", "time [us]", *(f"NEES {part}" for part in NEES)):
+    for head in (
+        *heads,
+        "height, end [mm]",
+        "rejected [%]",
+        "falls",
+        "time [us]",
+        *(f"NEES {part}" for part in NEES),
+    ):
         view.add_column(head, justify="right")
     for row in rows:
         cells = [row["motion"], row["filter"], str(row["seeds"])]
         if row["seeds"]:
             cells += [f"{row['velocity']:.4f}", f"{row['worst']:.3f}", f"{row['tilt']:.2f}"]
             cells += [f"{1e3 * row['height']:.1f}"]
-            cells += [f"{100 * row['rejected']:.2f}" if "rejected" in row else "", f"{row['us']:.0f}"]
+            cells += [f"{100 * row['rejected']:.2f}" if "rejected" in row else "", str(row.get("falls", ""))]
+            cells.append(f"{row['us']:.0f}")
             for part in NEES if "nees_velocity" in row else ():
                 low, high = row[f"band_{part}"]
                 value = row[f"nees_{part}"]

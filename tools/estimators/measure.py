@@ -39,6 +39,7 @@ class Score:
         rejected: share of updates with a foot that carries and does not slip that were not made.
         used_slip: share of feet that slip by more than 0.2 m/s under load and were used all the same.
         us: median time of a tick [us].
+        falls: how often the estimator began anew; 0 for the references.
     """
 
     motion: str
@@ -53,6 +54,7 @@ class Score:
     rejected: float
     used_slip: float
     us: float
+    falls: int
 
 
 def truth(log: Log, row: np.ndarray) -> Array:
@@ -62,9 +64,11 @@ def truth(log: Log, row: np.ndarray) -> Array:
     return np.column_stack([np.einsum("nij,ni->nj", C, x[:, 19:22]), -C[:, 2], x[:, 2]])
 
 
-def play(readings: Readings, cfg: EstimatorCfg | None = None) -> tuple[list[Estimate | None], Array]:
+def play(
+    readings: Readings, cfg: EstimatorCfg | None = None, estimator: Estimator | None = None
+) -> tuple[list[Estimate | None], Array]:
     """The estimator's output at each reading, and what each took [s], (n,)."""
-    estimator, out, took = Estimator(cfg), [], []
+    estimator, out, took = estimator or Estimator(cfg), [], []
     for reading in readings:
         began = time.perf_counter()
         out.append(estimator.update(*reading))
@@ -128,13 +132,15 @@ def measure(
     references: dict[str, Callable[[], Reference]] = {"cheetah": Cheetah, "invariant": Invariant}
     for name in filters:
         nees: tuple[float, ...] = ()
-        rejected = used_slip = np.nan
+        rejected, used_slip, falls = np.nan, np.nan, 0
         began = time.perf_counter()
         if name in references:
             out = run(references[name](), readings)
             us = (time.perf_counter() - began) / len(out)
         else:
-            estimates, took = play(readings, cfg)
+            estimator = Estimator(cfg)
+            estimates, took = play(readings, estimator=estimator)
+            falls = estimator.falls
             out, us = outputs(estimates), float(np.median(took))
             nees = consistency(estimates, log, readings)
             rejected, used_slip = gates(estimates, log, readings)
@@ -155,6 +161,7 @@ def measure(
                 rejected,
                 used_slip,
                 1e6 * us,
+                falls,
             )
         )
     return scores

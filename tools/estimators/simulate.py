@@ -24,7 +24,7 @@ from tools.closed_loop import RunCfg, disturbed_start
 ROOT = Path(__file__).resolve().parents[2]
 Array = NDArray[np.float64]
 PHYSICS, SENSORS = 0.001, 0.002  # s
-MOTIONS = ("stand", "trot", "footstand", "handstand", "flip")
+MOTIONS = ("stand", "trot", "footstand", "handstand", "flip", "fall")
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Log:
         force: normal forces of the feet [N], (n, 4).
         x: state, (n, 37).
         slip: speed of each foot's lowest point in the ground's plane [m/s], (n, 4).
-        kept: whether the robot did what it should: no fall, the flip caught.
+        kept: whether the robot did what it should: no fall, the flip caught, or at rest after a fall.
     """
 
     t: Array
@@ -136,7 +136,8 @@ def simulate(motion: str, seconds: float, seed: int, cfg: BodyCfg | None = None)
     """Record a motion.
 
     Args:
-        motion: one of `MOTIONS`; the flip takes the foot stand's and the handstand's time from `seconds`.
+        motion: one of `MOTIONS`; the flip takes the foot stand's and the handstand's time from `seconds`, the
+            fall is a handstand that goes limp after a second.
         seconds: length [s].
         seed: of the robot's body and of its start.
 
@@ -153,6 +154,8 @@ def simulate(motion: str, seconds: float, seed: int, cfg: BodyCfg | None = None)
     stance = FOOTSTAND if motion == "footstand" else HANDSTAND
     x = stance.state().numpy()
     recorder = Recorder(model, x, x[7:19])
+    if motion == "fall":
+        return _fall(recorder, seconds)
     hold(recorder, Policy(policy_path(motion)), round(seconds / go2.DT), 0)
     return recorder.log(bool(stance.held(torch.from_numpy(recorder.x)[None])))
 
@@ -205,3 +208,11 @@ def _flip(model: mujoco.MjModel, seconds: float, seed: int) -> Log:
     hold(recorder, modes["jump"], jump, before)
     hold(recorder, modes["hand"], round(seconds / go2.DT) - before - jump, before + jump)
     return recorder.log(bool(HANDSTAND.held(torch.from_numpy(recorder.x)[None])))
+
+
+def _fall(recorder: Recorder, seconds: float) -> Log:
+    """The handstand for a second, then the joints at the pose of four feet: it topples, and comes to lie."""
+    steps = min(50, round(seconds / go2.DT))
+    hold(recorder, Policy(policy_path("handstand")), steps, 0)
+    recorder.run(go2.HOME.double().numpy(), seconds - steps * go2.DT)
+    return recorder.log(bool(np.linalg.norm(recorder.x[19:25]) < 0.1))
