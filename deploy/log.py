@@ -28,9 +28,10 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from deploy.ekf import N
 from deploy.process import Job, told, until_told
 
-VERSION = "1"
+VERSION = "2"
 METADATA = "hmc"
 STATE, COMMAND, TICK_RECORD, PLAN, EVENT = range(5)
 TOPICS = ("rt/lowstate", "rt/lowcmd", "tick", "plan", "event")
@@ -47,7 +48,7 @@ TICK = np.dtype(
         ("late", "f8"),  # ms
         ("compute", "f8"),  # ms from the frame's arrival until the command left
         ("x", "f8", 37),
-        ("variance", "f8", 27),
+        ("variance", "f8", N),
         ("u", "f8", 12),
         ("contact", "i4", 4),
     ]

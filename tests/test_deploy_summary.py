@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deploy import memory
-from deploy.ekf import R
+from deploy.ekf import N, R
 from deploy.memory import Memory
 from deploy.summary import accuracy
 from hmc.go2.stances import FOOTSTAND
@@ -41,7 +41,7 @@ def test_the_estimate_against_the_truth(tmp_path):
     np.savez(tmp_path / "truth.npz", tick=[20, 40, 60, 80], qpos=x[:, :19], qvel=x[:, 19:])
     ticks: list[dict[str, Any]] = []
     for i in range(4):
-        told, variance = x[i].copy(), np.full(27, 0.1)
+        told, variance = x[i].copy(), np.full(N, 0.1)
         told[19:21] += (0.03, 0.04)
         told[2] += 0.02 if i == 3 else -0.001
         variance[R] = (9.0, 9.0, 1e-4)
