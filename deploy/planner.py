@@ -13,13 +13,12 @@ import numpy as np
 import torch
 
 from deploy.modes import FOOT, HAND, JUMP, NAMES, NONE, due
-from deploy.others import Others
 from deploy.process import ROOT, Job, allowed, told, until_told
 from deploy.settings import DeployCfg, PlanCfg
 from deploy.slots import PLAN, STEPS, Board
 from hmc import Evaluator, Schedule, Task, Trace, make_start, plan
 from hmc.cfg import load
-from hmc.go2.ensemble import EnsembleCfg
+from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.model import DT
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import FlipCfg, flip_task
@@ -42,7 +41,7 @@ class PlannerCfg:
         search: effort of every other plan.
         mpc: whether the jump is planned by sampling MPC inside the plans; else its guess is played as it is.
         others: robots that a flip is tried on before it is sent.
-        landed: share of them that have to end in the handstand.
+        landed: share of them and the nominal one that have to end in the handstand.
         patience: flips in a row that too few land, after which the first way is looked for anew.
         commit: whether a flip that was sent is left alone until the handstand. A new plan is made for a state
             0.2 s and more ahead, where planning takes so long: in flight that is worth less than a plan that
@@ -123,7 +122,7 @@ class Planner:
             max(worlds_for(self.task, it.samples, 0, it.pairs + it.moves) for it in searches)
         )
         self._one = self.task.make_sim(1)
-        self._others = Others(self.task, cfg.others, seed=seed, threads=threads)
+        self._others = replace(self.task, ensemble=make_ensemble(cfg.others, seed=seed, threads=threads))
         self._refused = 0  # flips in a row that too few of them landed
         self._shipped: dict[int, Shipped] = {}
         self._number = 0
@@ -191,7 +190,7 @@ class Planner:
         trace = found.known
         if trace.schedule != found.schedule:
             trace = self._follow(start, found.schedule.modes, trace)
-        reached = len(trace) == self._horizon and bool(HANDSTAND.held(trace.x[-1:]))
+        reached = self._reached(trace)
         if start.mode != FOOT:
             return self._ship(state, begin, start, trace)
         if searching:
@@ -204,10 +203,18 @@ class Planner:
             trace = self._follow(start, [FOOT] * self._horizon)
         return self._ship(state, begin, start, trace)
 
+    def landed(self, start: Start, modes: Sequence[int]) -> float:
+        """Share of the other robots and the nominal one that are in the handstand after a schedule."""
+        evaluator = Evaluator(self._others, self._one, start)
+        evaluator.follow(Schedule(tuple(modes), NAMES))
+        return float(np.mean([self._reached(trace) for trace in evaluator.trunks]))
+
+    def _reached(self, trace: Trace) -> bool:
+        return len(trace) == self._horizon and bool(HANDSTAND.held(trace.x[-1:]))
+
     def _agreed(self, start: Start) -> bool:
         """Whether enough other robots land the flip that was found."""
-        wanted = self._cfg.landed * self._others.count
-        agreed = self._others.landed(start, self._guess) >= wanted
+        agreed = self.landed(start, self._guess) >= self._cfg.landed
         self._refused = 0 if agreed else self._refused + 1
         if self._refused >= self._cfg.patience:
             self._known, self._guess, self._refused = False, [FOOT] * self._horizon, 0

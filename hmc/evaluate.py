@@ -80,6 +80,11 @@ class Evaluator:
         return self._trunk[0]
 
     @property
+    def trunks(self) -> Traces:
+        """The same on each member of an ensemble; one where there is none."""
+        return self._trunk
+
+    @property
     def pending(self) -> int:
         """Control steps, modes' own aside, that it takes to record what is followed; 0 if it is recorded."""
         if self._next is None:
