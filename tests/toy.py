@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -151,7 +153,8 @@ def slow_cost(task: Task, modes, x, u=(0.0,), mode=None, memory=None, k=0) -> fl
         mode = index
     for j, final in enumerate(task.cost.terminal.values(), len(task.cost.stage)):
         sums[j] = float(final(sim.x(), torch.tensor([k + len(modes)]))[0])
-    return sum(sums) if math.isfinite(sum(sums)) else math.inf
+    cost = reduce(operator.add, sums)  # sum() compensates what rounding loses since Python 3.12
+    return cost if math.isfinite(cost) else math.inf
 
 
 def all_schedules(num_modes: int, horizon: int) -> Tensor:
