@@ -92,7 +92,7 @@ class Counting(Network):
         self.value = value
         self.anchors: list[np.ndarray] = []
 
-    def act(self, x, u, anchor):
+    def act(self, x, u, anchor, command=None):
         self.anchors.append(anchor[0])
         return np.full((1, 12), self.value)
 

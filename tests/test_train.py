@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from hmc.cfg import load
 from hmc.cli import one_line_errors
 from tests.tiny import CFG, make_runner
 from tools.random_policy import write_random_policy
 from tools.render import EVERY, strip_steps
 from train import play, ppo
-from train.config import TrainCfg, rsl_config
+from train.config import StanceTraining, read_training, rsl_config
 from train.runner import read_checkpoint
+from train.starts import Starts
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,9 @@ def test_a_checkpoint_says_how_it_was_made(trained):
 
 def test_resume_goes_on_where_it_was(trained):
     folder, runner, _ = trained
-    runner.env.starts.success[3, 2] = 0.4
+    starts = runner.env.starts
+    assert isinstance(starts, Starts)
+    starts.success[3, 2] = 0.4
     runner.env.starts.rates[0] = 0.7
     runner.save(str(folder / "model_1.pt"))
     expected = torch.rand(3), np.random.rand(), random.random()  # noqa: NPY002
@@ -74,7 +76,8 @@ def test_resume_goes_on_where_it_was(trained):
     other.resume(str(folder / "latest.pt"))
     assert other.current_learning_iteration == 2
     assert other.logger.tot_timesteps == 96
-    assert torch.equal(other.env.starts.success, runner.env.starts.success)
+    assert isinstance(other.env.starts, Starts)
+    assert torch.equal(other.env.starts.success, starts.success)
     assert torch.equal(other.env.starts.rates, runner.env.starts.rates)
     for ours, theirs in ((other.alg.actor, runner.alg.actor), (other.alg.critic, runner.alg.critic)):
         theirs = theirs.state_dict()
@@ -180,7 +183,7 @@ def test_a_checkpoint_that_cannot_be_read(trained, tmp_path):
 
 def test_a_checkpoint_of_other_networks(trained, tmp_path):
     folder, *_ = trained
-    bigger = TrainCfg(CFG.env, ppo=type(CFG.ppo)(hidden=(4,)))
+    bigger = StanceTraining(CFG.env, ppo=type(CFG.ppo)(hidden=(4,)))
     runner = make_runner(tmp_path, bigger)
     with pytest.raises(ValueError, match=r"do not fit .* hidden layers are \[4\]: set ppo\.hidden"):
         runner.resume(str(folder / "model_1.pt"))
@@ -270,12 +273,11 @@ def test_only_the_first_process_writes(tmp_path):
 
 
 def test_experiment_files():
-    for name in ("handstand", "footstand", "handstand_robust", "footstand_robust"):
-        cfg = load(ppo.ROOT / "cfg" / f"{name}.toml", TrainCfg)
-        assert cfg.env.mode == name.removesuffix("_robust")
-        assert sum(
-            getattr(cfg.env.starts, kind) for kind in ("stance", "way", "home", "recorded")
-        ) == pytest.approx(1)
+    kinds = ("stance", "way", "home", "recorded", "standing", "fallen", "stances")
+    for name in ("handstand", "footstand", "handstand_robust", "footstand_robust", "stand", "getup", "walk"):
+        cfg = read_training(mode := name.removesuffix("_robust"), name)
+        assert cfg.env.mode == mode
+        assert sum(getattr(cfg.env.starts, kind, 0.0) for kind in kinds) == pytest.approx(1)
         assert rsl_config(cfg.ppo)["algorithm"]["learning_rate"] == cfg.ppo.learning_rate
 
 

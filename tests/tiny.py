@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from train import env
-from train.config import PpoCfg, TrainCfg, metadata, rsl_config
-from train.env import EnvCfg, StanceEnv
+from train import make
+from train.config import PpoCfg, StanceTraining, TrainCfg, metadata, rsl_config
 from train.runner import Runner
+from train.stance import StanceCfg, StanceEnv
 from train.starts import StartsCfg
 
 STARTS = StartsCfg(stance=0.5, way=0.3, home=0.2, furthest=-1.0)
-CFG = TrainCfg(
-    env=EnvCfg(mode="handstand", worlds=8, episode_steps=20, starts=STARTS),
+CFG = StanceTraining(
+    env=StanceCfg(mode="handstand", worlds=8, episode_steps=20, starts=STARTS),
     ppo=PpoCfg(iterations=2, steps=6, epochs=1, minibatches=2, hidden=(16, 8)),
 )
 
 
-def make_env(cfg: EnvCfg = CFG.env) -> StanceEnv:
+def make_env(cfg: StanceCfg = CFG.env) -> StanceEnv:
     """The environment on the C engine, one thread."""
-    return env.make_env(cfg, "mujoco", threads=1)
+    env = make.make_env(cfg, "mujoco", threads=1)
+    assert isinstance(env, StanceEnv)
+    return env
 
 
 def make_runner(folder: Path, cfg: TrainCfg = CFG, argv: tuple[str, ...] = (), seed: int = 7) -> Runner:

@@ -11,7 +11,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from train.env import EnvCfg, both_sides
+from hmc.cfg import load
+from hmc.go2.stances import STANCES
+from train.env import both_sides
+from train.legs import LegsCfg
+from train.stance import StanceCfg
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -55,10 +59,29 @@ class PpoCfg:
 
 @dataclass(frozen=True)
 class TrainCfg:
-    """An experiment file in cfg/."""
+    """An experiment file in cfg/; which of the two below it is depends on the mode."""
 
-    env: EnvCfg
+    env: StanceCfg | LegsCfg
     ppo: PpoCfg = field(default_factory=PpoCfg)
+
+
+@dataclass(frozen=True)
+class StanceTraining(TrainCfg):
+    """Of a stance."""
+
+    env: StanceCfg
+
+
+@dataclass(frozen=True)
+class LegsTraining(TrainCfg):
+    """Of a mode on four legs."""
+
+    env: LegsCfg
+
+
+def read_training(mode: str, name: str, overrides: Sequence[str] = ()) -> TrainCfg:
+    """The experiment file cfg/NAME.toml of a mode."""
+    return load(ROOT / "cfg" / f"{name}.toml", StanceTraining if mode in STANCES else LegsTraining, overrides)
 
 
 def rsl_config(cfg: PpoCfg) -> dict[str, Any]:

@@ -24,9 +24,9 @@ from tensordict import TensorDict  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
 from hmc.cli import one_line_errors  # noqa: E402
-from hmc.go2.facts import OBS_SIZE, contract  # noqa: E402
-from hmc.go2.policy import Policy  # noqa: E402
-from hmc.go2.stances import STANCES  # noqa: E402
+from hmc.go2.facts import COMMANDS, OBS_SIZE, contract  # noqa: E402
+from hmc.go2.network import Network  # noqa: E402
+from hmc.go2.stances import HOLDS  # noqa: E402
 from train.config import config_hash, portable  # noqa: E402
 from train.runner import read_checkpoint  # noqa: E402
 
@@ -37,7 +37,7 @@ def actor_of(checkpoint: dict[str, Any]) -> MLPModel:
     layers = [
         value.shape[0] for key, value in state.items() if key.startswith("mlp") and key.endswith("weight")
     ]
-    obs = TensorDict({"policy": torch.zeros(1, OBS_SIZE)}, batch_size=[1])
+    obs = TensorDict({"policy": torch.zeros(1, state["mlp.0.weight"].shape[1])}, batch_size=[1])
     actor = MLPModel(
         obs,
         {"actor": ["policy"]},
@@ -68,7 +68,8 @@ def export(checkpoint: Path, out: Path) -> None:
     data = read_checkpoint(checkpoint)
     meta = data["infos"]["meta"]
     config = portable(json.loads(meta["config"]))
-    stance = STANCES[config["env"]["mode"]]
+    mode = config["env"]["mode"]
+    command = COMMANDS.get(mode, ())
     module = _Deterministic(actor_of(data)).eval()
     partial = out.with_suffix(".partial.onnx")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
@@ -76,7 +77,7 @@ def export(checkpoint: Path, out: Path) -> None:
         warnings.simplefilter("ignore", FutureWarning)  # torch about itself
         torch.onnx.export(
             module,
-            (torch.zeros(2, OBS_SIZE),),
+            (torch.zeros(2, OBS_SIZE + len(command)),),
             str(partial),
             input_names=["obs"],
             output_names=["actions"],
@@ -88,8 +89,9 @@ def export(checkpoint: Path, out: Path) -> None:
     model = onnx.load(str(partial))
     fields = {
         **contract(),
-        "mode": stance.name,
-        "default_pose": [round(float(v), 6) for v in stance.pose],
+        "mode": mode,
+        "command": list(command),
+        "default_pose": [round(float(v), 6) for v in HOLDS[mode].pose],
         "action_scale": config["env"]["action_scale"],
         "training_command": shlex.join(portable(shlex.split(meta["command"]))),
         "training_seed": int(meta["seed"]),
@@ -103,7 +105,7 @@ def export(checkpoint: Path, out: Path) -> None:
     for key, value in fields.items():
         model.metadata_props.add(key=key, value=json.dumps(value))
     onnx.save(model, str(partial))
-    Policy(partial)  # refuses what it would refuse later
+    Network(partial)  # refuses what it would refuse later
     os.replace(partial, out)
 
 

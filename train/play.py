@@ -8,17 +8,22 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from hmc.go2.facts import COMMANDS
 from hmc.go2.model import load_model
 from hmc.go2.policy import Policy
-from hmc.go2.stances import STANCES
+from hmc.go2.stances import HOLDS, STANCES
 from hmc.sim.mujoco import MujocoSim
+from train.evaluate import on_its_legs
 from train.export import export
+from train.fallen import LegsStarts, LegsStartsCfg
 from train.runner import read_checkpoint
 from train.starts import Starts, StartsCfg
 
+WALK = (0.6, 0.0, 0.0)  # what a walk is recorded at: forward, sideways [m/s], turn [rad/s]
 RENDER = Path(__file__).resolve().parents[1] / "tools" / "render.py"
 
 
@@ -39,15 +44,10 @@ def play(
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder:
         export(checkpoint, Path(folder) / "policy.onnx")
-        policy = Policy(Path(folder) / "policy.onnx")
-    stance = STANCES[mode]
-    starts = Starts(
-        stance,
-        StartsCfg(**{**cfg["starts"], "recorded": 0.0, "records": ""}),
-        torch.device("cpu"),
-        unlocked=True,
-    )
-    start = starts.sample(1)
+        told = (lambda x, k: x.new_tensor(WALK).expand(len(x), 3)) if mode in COMMANDS else None
+        policy = Policy(Path(folder) / "policy.onnx", command=told)
+    good = on_its_legs if told else HOLDS[mode].held
+    start = _starts(mode, cfg["starts"]).sample(1)
     sim = MujocoSim(load_model(), 1, threads=threads)
     sim.reset(start.x, start.u)
     k = torch.zeros(1, dtype=torch.long)
@@ -57,7 +57,7 @@ def play(
         steps.append({"mode": mode, "x": [round(v, 6) for v in sim.x()[0].tolist()]})
         action, memory = policy.act(sim.x(), sim.u(), memory, k + step)
         sim.step(action)
-        held.append(bool(stance.held(sim.x())[0]))
+        held.append(bool(good(sim.x())[0]))
     out.mkdir(parents=True, exist_ok=True)
     log = out / "play.json"
     partial = log.with_suffix(".partial")
@@ -68,3 +68,11 @@ def play(
         line += f", first after {(held.index(True) + 1) * sim.dt:.2f} s"
     drawn = subprocess.run([sys.executable, str(RENDER), str(log)], capture_output=True, text=True)
     return f"{line}\n{(drawn.stdout or drawn.stderr).strip()}"
+
+
+def _starts(mode: str, cfg: dict[str, Any]) -> Starts | LegsStarts:
+    """Where episodes began in training."""
+    if mode in STANCES:
+        cfg = {**cfg, "recorded": 0.0, "records": ""}
+        return Starts(STANCES[mode], StartsCfg(**cfg), torch.device("cpu"), unlocked=True)
+    return LegsStarts(LegsStartsCfg(**cfg), torch.device("cpu"))

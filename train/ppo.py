@@ -15,10 +15,9 @@ sys.path.insert(0, str(ROOT))
 import torch  # noqa: E402
 import tyro  # noqa: E402
 
-from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
-from train.config import TrainCfg, metadata, rsl_config  # noqa: E402
-from train.env import make_env  # noqa: E402
+from train.config import metadata, read_training, rsl_config  # noqa: E402
+from train.make import make_env  # noqa: E402
 from train.runner import Runner  # noqa: E402
 
 
@@ -42,7 +41,7 @@ class Args:
         play: a checkpoint to record an episode of, instead of training.
     """
 
-    mode: Literal["handstand", "footstand"]
+    mode: Literal["handstand", "footstand", "stand", "getup", "walk"]
     stage: str = ""
     engine: Literal["auto", "mujoco", "warp"] = "auto"
     device: str = "auto"
@@ -80,7 +79,7 @@ def under_torchrun(args: Args) -> Args:
 
 def set_up(args: Args) -> Runner:
     """Everything that training needs; what the user got wrong is a ValueError."""
-    cfg = load(ROOT / "cfg" / f"{args.name}.toml", TrainCfg, args.set)
+    cfg = read_training(args.mode, args.name, args.set)
     args = under_torchrun(args)
     torch.manual_seed(args.seed)
     if args.threads:

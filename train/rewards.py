@@ -1,4 +1,4 @@
-"""Reward terms of the stances: names, units and sources."""
+"""Reward terms: names, units and sources."""
 
 from __future__ import annotations
 
@@ -87,11 +87,118 @@ def stage_rewards(
         "orientation": cfg.orientation * orientation,
         "stillness": cfg.stillness * height * orientation * still,
         "contact": -cfg.contact * (gap["foot"][:, stance.swing] < 0.005).sum(1),
-        "limits": -cfg.limits * ((q - MIDDLE.to(q)).abs() - REACH.to(q)).clamp(min=0).sum(1),
         "posture": -cfg.posture * off[:, stance.free[0] // 2],
         "stance_posture": -cfg.stance_posture * off[:, stance.support[0] // 2],
+        **efforts(cfg, x, before, torque, u, u_prev, dt),
+        "drift": -cfg.drift * (x[:, :2] - anchor[:, :2]).square().sum(1).clamp(max=4.0),
+    }
+
+
+def efforts(
+    cfg: RewardCfg | LegsRewardCfg,
+    x: Tensor,
+    before: Tensor,
+    torque: Tensor,
+    u: Tensor,
+    u_prev: Tensor,
+    dt: float,
+) -> dict[str, Tensor]:
+    """What moving costs in every mode, name -> (n,); arguments as of `stage_rewards`, torque (n, 12)."""
+    q, qd = x[:, 7:19], x[:, 25:37]
+    return {
+        "limits": -cfg.limits * ((q - MIDDLE.to(q)).abs() - REACH.to(q)).clamp(min=0).sum(1),
         "power": -cfg.power * (torque * qd).abs().sum(1),
         "acceleration": -cfg.acceleration * ((qd - before[:, 25:37]) / dt).square().sum(1),
         "target_rate": -cfg.target_rate * (u - u_prev).square().sum(1),
-        "drift": -cfg.drift * (x[:, :2] - anchor[:, :2]).square().sum(1).clamp(max=4.0),
     }
+
+
+@dataclass(frozen=True)
+class LegsRewardCfg:
+    """Weight of each term on four legs, a second of simulated time; the first seven earn, the others cost.
+
+    With o = (1 + cos tilt) / 2 and h = exp(-max(0, 0.28 - z) / 0.1), z the base height [m]. Tracking is that
+    of legged_gym (Rudin et al. 2021), as is rewarding feet for their time in the air; upright, height and
+    posture follow MuJoCo Playground's Go1 getup task.
+
+    Attributes:
+        upright: o.
+        height: o h.
+        posture: o h exp(-|q - q_home|^2 / 2) [rad].
+        stillness: o h exp(-|v|^2 - 0.1 |omega|^2) where the command is to stand, v [m/s], omega [rad/s].
+        track: o h exp(-|v - v_command|^2 / 0.1), over the ground.
+        turn: o h exp(-(omega_z - omega_command)^2 / 0.25).
+        air: once, when a foot comes down while the robot is to move: how much longer than 0.15 s it was in
+            the air, 0.35 s at most [s].
+        bounce: v_z^2 + 0.05 (omega_x^2 + omega_y^2).
+        touch: number of thighs and shins on the ground, and of trunks.
+        limits: sum of joint positions beyond 95 % of their range [rad].
+        power: sum |torque x speed| [W].
+        acceleration: sum of squared joint accelerations [rad^2/s^4].
+        target_rate: sum of squared changes of the joint targets [rad^2].
+        termination: once, when an episode ends in a fall.
+    """
+
+    upright: float = 1.0
+    height: float = 1.0
+    posture: float = 0.5
+    stillness: float = 0.5
+    track: float = 0.0
+    turn: float = 0.0
+    air: float = 0.0
+    bounce: float = 0.0
+    touch: float = 0.1
+    limits: float = 1.0
+    power: float = 0.001
+    acceleration: float = 2.5e-7
+    target_rate: float = 0.05
+    termination: float = 1.0
+
+
+def legs_rewards(
+    cfg: LegsRewardCfg,
+    x: Tensor,
+    before: Tensor,
+    u: Tensor,
+    u_prev: Tensor,
+    velocity: Tensor,
+    command: Tensor,
+    landed: Tensor,
+    dt: float,
+    gap: dict[str, Tensor],
+) -> dict[str, Tensor]:
+    """Weighted reward terms of one control step on four legs, name -> (n,), not yet multiplied by dt.
+
+    Args:
+        cfg: weights.
+        x: state after the step (n, 37).
+        before: state before it.
+        u: joint targets of the step (n, 12) [rad].
+        u_prev: those of the step before.
+        velocity: forward, sideways [m/s] and turn [rad/s], (n, 3).
+        command: what it should be, likewise.
+        landed: of feet on the ground, how long they were in the air until this step [s], (n, 4).
+        dt: control step [s].
+        gap: `clearances` of x.
+    """
+    q, qd = x[:, 7:19], x[:, 25:37]
+    upright = 0.5 + 0.5 * go2.vertical(x[:, 3:7])[:, 2]
+    high = upright * torch.exp(-(0.28 - x[:, 2]).clamp(min=0) / 0.1)
+    off = velocity - command
+    moves = command.norm(dim=1) > 0.1
+    still = high * torch.exp(-x[:, 19:22].square().sum(1) - 0.1 * x[:, 22:25].square().sum(1))
+    air = torch.where(landed > 0, landed.clamp(max=0.35) - 0.15, 0.0).sum(1) / dt
+    torque = go2.motor_torque(q, qd, u)
+    touching = (gap["thigh"] < 0).sum(1) + (gap["calf"] < 0).sum(1) + (gap["trunk"] < 0)
+    terms = {
+        "upright": cfg.upright * upright,
+        "height": cfg.height * high,
+        "posture": cfg.posture * high * torch.exp(-0.5 * (q - go2.HOME.to(q)).square().sum(1)),
+        "stillness": cfg.stillness * torch.where(moves, 0.0, still),
+        "track": cfg.track * high * torch.exp(-off[:, :2].square().sum(1) / 0.1),
+        "turn": cfg.turn * high * torch.exp(-off[:, 2].square() / 0.25),
+        "air": cfg.air * torch.where(moves, air, 0.0),
+        "bounce": -cfg.bounce * (x[:, 21].square() + 0.05 * x[:, 22:24].square().sum(1)),
+        "touch": -cfg.touch * touching,
+    }
+    return terms | efforts(cfg, x, before, torque, u, u_prev, dt)

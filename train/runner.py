@@ -19,13 +19,13 @@ from rich.live import Live
 from rich.table import Table
 from rsl_rl.runners import OnPolicyRunner
 
-from train.env import StanceEnv
+from train.env import Go2Env
 
 CHECKPOINT_KEYS = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter", "infos")
 
 
 class Runner(OnPolicyRunner):
-    """`OnPolicyRunner` for one `StanceEnv`.
+    """`OnPolicyRunner` for one `Go2Env`.
 
     A checkpoint also holds the random state, the start-state curriculum and the number of environment
     steps, and is written to a temporary file that replaces the old one only when it is complete.
@@ -38,9 +38,9 @@ class Runner(OnPolicyRunner):
         meta: what the exported policy will say about its training.
     """
 
-    env: StanceEnv
+    env: Go2Env
 
-    def __init__(self, env: StanceEnv, cfg: dict[str, Any], log_dir: str, device: str, meta: dict[str, str]):
+    def __init__(self, env: Go2Env, cfg: dict[str, Any], log_dir: str, device: str, meta: dict[str, str]):
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             super().__init__(env, cfg, log_dir, device)
         self.meta = meta

@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from hmc.go2 import model as go2
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, Stance
+from train.env import Start
 
 ROOT = Path(__file__).resolve().parents[1]
 GRAVITY = 9.81
@@ -54,15 +54,6 @@ class StartsCfg:
     records: str = ""
 
 
-class Start(NamedTuple):
-    """A batch of starts: states (n, 37), inputs (n, 12), kind (n,) and cell of the way's grid (n,)."""
-
-    x: Tensor
-    u: Tensor
-    kind: Tensor
-    cell: Tensor
-
-
 class Starts:
     """Draws start states for one stance and learns from how the episodes ended.
 
@@ -77,6 +68,7 @@ class Starts:
     ENERGY_LOW, ENERGY_HIGH = 0.0, 1.4
     AHEAD = 256  # sampled at once; the curriculum moves little in the time that they last
     HORIZONTAL = 0.2  # four-legged starts wait until the way is open up to here
+    kinds = KINDS
 
     def __init__(self, stance: Stance, cfg: StartsCfg, device: torch.device, *, unlocked: bool = False):
         self.stance, self.cfg, self.device = stance, cfg, device
@@ -162,6 +154,10 @@ class Starts:
         good = (self.success > 0.35).any(1).nonzero()
         rows = int(good.max()) + 1 if len(good) else 0
         return 1.0 - rows * self.WIDTH
+
+    def log(self) -> dict[str, float]:
+        """How far the way is open."""
+        return {"frontier": self.frontier()}
 
     def state_dict(self) -> dict[str, Tensor]:
         """What a checkpoint must keep."""

@@ -45,6 +45,8 @@ SUBSTEPS = 4  # physics steps a control step
 
 OBS_SIZE = 48
 OBS_VERSION = 1  # of `hmc.go2.observe`
+# what a learned mode is commanded by, at the end of its observation; its base position is only a height
+COMMANDS = {"walk": ("forward [m/s]", "sideways [m/s]", "turn [rad/s]")}
 
 
 def contract() -> dict[str, Any]:

@@ -64,6 +64,7 @@ class Network:
         path: of the file.
         metadata: its contract, see `hmc.go2.facts.contract`, and how it was made.
         mode: its name there.
+        command: names and units of the numbers that it is commanded by, after the observation; mostly none.
 
     Args:
         path: ONNX file with its contract in the metadata.
@@ -93,17 +94,22 @@ class Network:
         if wrong := facts.disagreement(self.metadata):
             raise ValueError(f"policy {self.path}: {wrong}")
         self.mode = str(self.metadata["mode"])
+        self.command = tuple(self.metadata.get("command", ()))
         self._pose = np.array(self.metadata["default_pose"], dtype=np.float64)
         self._scale = float(self.metadata["action_scale"])
 
-    def act(self, x: Array, u: Array, anchor: Array) -> NDArray[np.float64]:
-        """Joint targets [rad], (n, 12); arguments as of `observe`."""
-        output = self.run(observe(x, u, anchor).astype(np.float32))
+    def act(self, x: Array, u: Array, anchor: Array, command: Array | None = None) -> NDArray[np.float64]:
+        """Joint targets [rad], (n, 12); arguments as of `observe`, and the command (n, c) if it obeys one."""
+        obs = observe(x, u, anchor)
+        if command is not None:
+            obs[:, 3:5] = 0.0
+            obs = np.concatenate([obs, command], 1)
+        output = self.run(obs.astype(np.float32))
         target = self._pose + self._scale * output.astype(np.float64)
         return np.minimum(np.maximum(target, LOWER), UPPER)
 
     def run(self, obs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The network's output, (n, 12), for observations (n, 48)."""
+        """The network's output, (n, 12), for observations with their commands (n, 48 + c)."""
         (output,) = self._session.run(None, {"obs": obs})
         return np.asarray(output)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -24,21 +25,37 @@ class Policy(Mode):
         path: ONNX file with its contract in the metadata.
         name: of the mode; default: the file's.
         threads: of onnxruntime; 0 for all cores. Actions do not depend on it.
+        command: of a policy that obeys one: what it is told at states x (n, 37) and control steps k (n,),
+            (n, c); a deterministic function of each row alone.
 
     Raises:
-        ValueError: the file cannot be read, or a field of its contract does not match; names it.
+        ValueError: the file cannot be read, a field of its contract does not match, or it obeys a command and
+            none is given, or the other way round; names it.
     """
 
     memory_size = 4
 
-    def __init__(self, path: str | Path, *, name: str = "", threads: int = 1):
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        name: str = "",
+        threads: int = 1,
+        command: Callable[[Tensor, Tensor], Tensor] | None = None,
+    ):
         self.network = Network(path, threads)
         self.name = name or self.network.mode
+        if bool(self.network.command) != (command is not None):
+            wants = ", ".join(self.network.command) or "no command"
+            got = "none is given" if command is None else "one is given"
+            raise ValueError(f"policy {path}: it obeys {wants}, and {got}: see the argument command")
+        self.command = command
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
         return anchor_of(x)
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         # in numpy: for few worlds a torch operation takes several times as long
-        target = self.network.act(*(each.cpu().numpy() for each in (x, u, memory)))
+        told = () if self.command is None else (self.command(x, k),)
+        target = self.network.act(*(each.cpu().numpy() for each in (x, u, memory, *told)))
         return torch.from_numpy(target).to(x), memory

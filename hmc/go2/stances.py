@@ -1,4 +1,4 @@
-"""The two stances, and what counts as standing in one."""
+"""The two stances and the four-legged stand, and what counts as standing in them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from torch import Tensor
 from hmc.go2 import model as go2
 
 MIN_HEIGHT = 0.45  # m, base
+MIN_STAND = 0.22  # m, base on four legs
 MAX_TILT = math.radians(20.0)
+TOUCH = 0.01  # m: a foot that is nearer to the ground stands on it
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,42 @@ class Stance:
         return x
 
 
+@dataclass(frozen=True)
+class Stand:
+    """Standing on all four feet.
+
+    Attributes:
+        pose: joint positions [rad], (12,).
+    """
+
+    pose: Tensor
+
+    def held(self, x: Tensor, gap: dict[str, Tensor] | None = None) -> Tensor:
+        """Whether the robot stands on its four feet, (n,) bool.
+
+        All of them on the ground; trunk, thighs and shins off it, base above 0.22 m, within 20 degrees of
+        level.
+
+        Args:
+            x: state (n, 37).
+            gap: `clearances` of x, if they are known.
+        """
+        gap = gap or go2.clearances(x)
+        clear = (gap["trunk"] > 0) & (gap["thigh"] > 0).all(1) & (gap["calf"] > 0).all(1)
+        clear &= (gap["foot"] < TOUCH).all(1) & (x[:, 2] > MIN_STAND)
+        return clear & (go2.vertical(x[:, 3:7])[:, 2] > math.cos(MAX_TILT))
+
+    def state(self) -> Tensor:
+        """The state at rest, (37,), float64."""
+        x = torch.zeros(37, dtype=torch.float64)
+        x[2], x[3] = go2.HOME_HEIGHT, 1.0
+        x[7:19] = self.pose
+        return x
+
+
 HANDSTAND = Stance("handstand", +1, go2.HANDSTAND, go2.FRONT, go2.REAR)
 FOOTSTAND = Stance("footstand", -1, go2.FOOTSTAND, go2.REAR, go2.FRONT)
 STANCES = {stance.name: stance for stance in (HANDSTAND, FOOTSTAND)}
+STAND = Stand(go2.HOME)
+# what the learned modes hold, or return to
+HOLDS: dict[str, Stance | Stand] = {**STANCES, "stand": STAND, "getup": STAND, "walk": STAND}

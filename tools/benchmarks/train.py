@@ -13,13 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hmc.cfg import load
 from hmc.go2.model import load_model
 from hmc.sim.ids import Ids
 from hmc.sim.mujoco import MujocoSim
 from tools.benchmarks.figures import Common, Figures
-from train.config import ROOT, TrainCfg, rsl_config
-from train.env import StanceEnv
+from train.config import read_training, rsl_config
+from train.make import env_on
 from train.runner import Runner
 
 
@@ -43,7 +42,7 @@ class Train(Common):
 def train(args: Train) -> Figures:
     """PPO as train/ppo.py runs it: the same configuration, environment and runner."""
     figures = Figures()
-    cfg = load(ROOT / "cfg" / f"{args.mode}.toml", TrainCfg, args.set)
+    cfg = read_training(args.mode, args.mode, args.set)
     torch.manual_seed(1)
     sim = MujocoSim(load_model(), cfg.env.worlds, threads=args.threads)
     spent, step, entries = [0.0], sim.step, []
@@ -56,7 +55,7 @@ def train(args: Train) -> Figures:
     sim.step = timed  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
         meta = {"command": "tools/bench.py", "seed": "1", "config": "{}", "config_sha256": ""}
-        runner = Runner(StanceEnv(cfg.env, sim), rsl_config(cfg.ppo), folder, "cpu", meta)
+        runner = Runner(env_on(cfg.env, sim), rsl_config(cfg.ppo), folder, "cpu", meta)
         began = [0.0]
 
         def update(log: dict[str, Any], extras: list[dict[str, Any]]) -> None:
