@@ -129,6 +129,13 @@ class Receding:
             progress=progress,
         )
 
+    def rewind(self, k: int) -> None:
+        """Go on at control step k of the task, wherever the loop was: goals come again, or are skipped.
+
+        The incumbent and the running mode stay; what was priced for other steps is forgotten.
+        """
+        self.k, self._known = k, None
+
     @torch.no_grad()
     def tick(self, x: Vector, u: Vector | None = None, snapshot: Tensor | None = None) -> Tick:
         """Plan from state x and give the input for this control step.

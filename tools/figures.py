@@ -15,7 +15,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-COLORS = {"foot": "#4c9f70", "jump": "#d1495b", "hand": "#edae49"}
+COLORS = {
+    "foot": "#4c9f70",
+    "jump": "#d1495b",
+    "hand": "#edae49",
+    "getup": "#6d597a",
+    "stand": "#adb5bd",
+    "walk": "#457b9d",
+}
 
 
 def timeline(
@@ -23,7 +30,7 @@ def timeline(
     modes: Sequence[str],
     pitch: np.ndarray,
     height: np.ndarray,
-    command: float,
+    commands: Sequence[float],
     dt: float,
     title: str,
 ) -> None:
@@ -34,7 +41,7 @@ def timeline(
         modes: name of the mode of each step (n,).
         pitch: [rad] (n,), +90 degrees nose down.
         height: of the base [m] (n,).
-        command: time at which the handstand is asked for [s].
+        commands: times at which something else is asked for [s].
         dt: control step [s].
         title: of the figure.
     """
@@ -45,13 +52,15 @@ def timeline(
     ):
         _bands(axis, modes, dt)
         axis.plot(time, values, color="black", linewidth=1.3)
-        axis.axvline(command, color="black", linestyle=":", linewidth=1)
+        for command in commands:
+            axis.axvline(command, color="black", linestyle=":", linewidth=1)
         axis.set_ylabel(label)
     axes[0].set_yticks([-90, -45, 0, 45, 90])
     axes[0].set_title(title, fontsize=10)
-    axes[1].set_xlabel("time [s]; dotted: the command")
-    handles = [Rectangle((0, 0), 1, 1, color=COLORS[name], alpha=0.35) for name in COLORS]
-    axes[0].legend(handles, COLORS, loc="lower right", ncols=3, fontsize=8)
+    axes[1].set_xlabel("time [s]; dotted: a command")
+    shown = [name for name in COLORS if name in modes]
+    handles = [Rectangle((0, 0), 1, 1, color=COLORS[name], alpha=0.35) for name in shown]
+    axes[0].legend(handles, shown, loc="lower right", ncols=3, fontsize=8)
     save(figure, path)
 
 

@@ -110,7 +110,7 @@ def write_run(out: Path, done: Run, task: Task, cfg: RunCfg, video: bool, consol
         names,
         pitch(x).numpy(),
         x[:, 2].numpy(),
-        cfg.task.command * dt,
+        [cfg.task.command * dt],
         dt,
         title,
     )

@@ -32,6 +32,7 @@ class Row(Protocol):
 
 
 R = TypeVar("R", bound=Row)
+S = TypeVar("S")
 
 
 def folder_of(out: Path, cfg: Any) -> Path:
@@ -81,8 +82,8 @@ def carry_out(
     return [rows[job] for job in jobs]
 
 
-def run_all(work: Callable[[Any], R], todo: Sequence[Any], processes: int, console: Console) -> Iterator[R]:
-    """Rows as they come, from a pool of processes."""
+def run_all(work: Callable[[Any], S], todo: Sequence[Any], processes: int, console: Console) -> Iterator[S]:
+    """Results as they come, from a pool of processes."""
     columns = (
         *Progress.get_default_columns()[:2],
         MofNCompleteColumn(),

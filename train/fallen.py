@@ -116,7 +116,8 @@ def lowest(x: Tensor) -> Tensor:
 
 
 def dropped(n: int, threads: int = 0) -> Tensor:
-    """States and inputs (n, 37 + 12) of robots that were dropped in any attitude and came to rest.
+    """States and inputs (n, 37 + 12) of robots that were dropped in any attitude and lie, most of them
+    at rest.
 
     They hold any pose on the way: joints uniform over their ranges, targets not far from it.
     """

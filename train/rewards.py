@@ -126,7 +126,7 @@ class LegsRewardCfg:
         height: o h.
         posture: o h exp(-|q - q_home|^2 / 2) [rad].
         stillness: o h exp(-|v|^2 - 0.1 |omega|^2) where the command is to stand, v [m/s], omega [rad/s].
-        track: o h exp(-|v - v_command|^2 / 0.1), over the ground.
+        track: o h exp(-|v - v_command|^2 / 0.25), over the ground.
         turn: o h exp(-(omega_z - omega_command)^2 / 0.25).
         air: once, when a foot comes down while the robot is to move: how much longer than 0.15 s it was in
             the air, 0.35 s at most [s].
@@ -195,7 +195,7 @@ def legs_rewards(
         "height": cfg.height * high,
         "posture": cfg.posture * high * torch.exp(-0.5 * (q - go2.HOME.to(q)).square().sum(1)),
         "stillness": cfg.stillness * torch.where(moves, 0.0, still),
-        "track": cfg.track * high * torch.exp(-off[:, :2].square().sum(1) / 0.1),
+        "track": cfg.track * high * torch.exp(-off[:, :2].square().sum(1) / 0.25),
         "turn": cfg.turn * high * torch.exp(-off[:, 2].square() / 0.25),
         "air": cfg.air * torch.where(moves, air, 0.0),
         "bounce": -cfg.bounce * (x[:, 21].square() + 0.05 * x[:, 22:24].square().sum(1)),

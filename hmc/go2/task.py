@@ -16,13 +16,16 @@ from hmc.cost import Cost, StageFn
 from hmc.go2 import model as go2
 from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.policy import Policy
-from hmc.go2.stances import FOOTSTAND, HANDSTAND
+from hmc.go2.stances import FOOTSTAND, HANDSTAND, STAND
 from hmc.modes import Mode, ModeSet, Motion
 from hmc.rules import Rules
 from hmc.sampling import SamplingCfg, SamplingMpc
 from hmc.sim.base import Sim
 from hmc.sim.mujoco import MujocoSim
 from hmc.task import Task
+
+TARGETS = (FOOTSTAND, HANDSTAND, STAND)  # what a cost may ask for
+FOOT_TARGET, HAND_TARGET, STAND_TARGET = range(3)
 
 
 @dataclass(frozen=True)
@@ -108,20 +111,26 @@ def timeline(command: int) -> Callable[[Tensor], Tensor]:
     return lambda k: k >= command
 
 
-def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
-    """Table I with a target stance that depends on the control step: `hand(k)` (n,) bool."""
+def stance_cost(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> Cost:
+    """Table I with a target that depends on the control step.
 
-    def height(x: Tensor, *_: Tensor) -> Tensor:
-        return cfg.height * (go2.STANCE_HEIGHT - x[:, 2]).square()
+    Args:
+        cfg: weights.
+        target: of control steps k (n,), as an index into `TARGETS`, or whether it is the handstand, (n,).
+    """
+
+    def height(x: Tensor, k: Tensor) -> Tensor:
+        rows = _targets(x.dtype, x.device)[0][target(k).long()]
+        return cfg.height * (rows - x[:, 2]).square()
 
     def orientation(x: Tensor, k: Tensor) -> Tensor:
         up = go2.vertical(x[:, 3:7])
-        target = _targets(x.dtype, x.device)[0][hand(k).long()]
-        return cfg.orientation * ((up[:, 0] + target).square() + up[:, 1].square())
+        gravity = _targets(x.dtype, x.device)[1][target(k).long()]
+        return cfg.orientation * ((up[:, 0] + gravity).square() + up[:, 1].square())
 
     def joints(x: Tensor, k: Tensor) -> Tensor:
-        target = _targets(x.dtype, x.device)[1][hand(k).long()]
-        return cfg.joints * (x[:, 7:19] - target).square().sum(1)
+        pose = _targets(x.dtype, x.device)[2][target(k).long()]
+        return cfg.joints * (x[:, 7:19] - pose).square().sum(1)
 
     def rate(x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
         return cfg.rate * (u - u_prev).square().sum(1)
@@ -131,14 +140,14 @@ def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
         return cfg.energy * power.norm(dim=1)
 
     def pose(x: Tensor, *_: Tensor) -> Tensor:
-        home = _targets(x.dtype, x.device)[2]
+        home = _targets(x.dtype, x.device)[2][STAND_TARGET]
         return cfg.pose * torch.exp(-(x[:, 7:19] - home).square().sum(1))
 
     def tail(x: Tensor, k: Tensor) -> Tensor:
-        return cfg.tail * (height(x) + orientation(x, k) + joints(x, k))
+        return cfg.tail * (height(x, k) + orientation(x, k) + joints(x, k))
 
     stage: dict[str, StageFn] = {
-        "height": height,
+        "height": lambda x, u, u_prev, k: height(x, k),
         "orientation": lambda x, u, u_prev, k: orientation(x, k),
         "joints": lambda x, u, u_prev, k: joints(x, k),
         "rate": rate,
@@ -150,12 +159,11 @@ def stance_cost(cfg: CostCfg, hand: Callable[[Tensor], Tensor]) -> Cost:
 
 @cache
 def _targets(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Of foot stand and handstand: gravity along the body's x axis (2,), pose (2, 12); home pose (12,)."""
-    stances = (FOOTSTAND, HANDSTAND)
+    """Of TARGETS: height [m] and gravity along the body's x axis, (3,) each, and pose (3, 12)."""
     with torch.inference_mode(False):
-        gravity = torch.tensor([float(stance.sign) for stance in stances], dtype=dtype, device=device)
-        pose = torch.stack([stance.pose for stance in stances]).to(device, dtype)
-        return gravity, pose, go2.HOME.to(device, dtype, copy=True)
+        state = torch.stack([each.state() for each in TARGETS]).to(device, dtype)
+        gravity = torch.tensor([-1.0, 1.0, 0.0], dtype=dtype, device=device)
+        return state[:, 2].clone(), gravity, state[:, 7:19].clone()
 
 
 def policy_path(name: str, given: str = "") -> Path:
