@@ -188,7 +188,7 @@ def test_dropped_robots_lie_in_any_attitude():
     assert (up < -0.8).sum() > 10, "on their backs"
     assert (up.abs() < 0.5).sum() > 10, "on their sides"
     assert (x[:, 19:22].norm(dim=1) < 0.3).float().mean() > 0.85, "most of them at rest"
-    assert (fallen.lowest(x).abs() < 0.02).float().mean() > 0.9, "on the ground"
+    assert (go2.lowest(x).abs() < 0.02).float().mean() > 0.9, "on the ground"
     assert ((u >= go2.Q_LOWER) & (u <= go2.Q_UPPER)).all()
 
 
@@ -215,7 +215,7 @@ def test_starts(monkeypatch):
 def test_disturbed_states_touch_the_ground():
     rest = torch.stack([STAND.state(), HANDSTAND.state()]).float().repeat(50, 1)
     x = disturbed(rest, LegsStartsCfg())
-    torch.testing.assert_close(fallen.lowest(x), torch.full((100,), 0.001), atol=1e-5, rtol=0)
+    torch.testing.assert_close(go2.lowest(x), torch.full((100,), 0.001), atol=1e-5, rtol=0)
     assert ((x[:, 7:19] - rest[:, 7:19]).abs() <= 0.15 + 1e-6).all()
     torch.testing.assert_close(x[:, 3:7].norm(dim=1), torch.ones(100))
 

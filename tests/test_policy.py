@@ -7,17 +7,18 @@ import re
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
 import torch
 from tensordict import TensorDict
 
 from hmc.go2 import model as go2
-from hmc.go2.facts import OBS_SIZE, contract
-from hmc.go2.network import LOWER, UPPER
+from hmc.go2.facts import COMMANDS, OBS_SIZE, contract
+from hmc.go2.network import LOWER, UPPER, Network
 from hmc.go2.observe import anchor_of, observe
 from hmc.go2.policy import Policy
-from hmc.go2.stances import HANDSTAND, STANCES
+from hmc.go2.stances import HANDSTAND, HOLDS
 from tests.tiny import CFG, make_runner
 from train.config import ROOT, config_hash, portable
 from train.export import actor_of, export
@@ -222,16 +223,17 @@ def test_export_leaves_nothing_half_done(checkpoint, tmp_path):
 
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)
 def test_committed_policies(path):
-    policy = Policy(path)
-    meta, stance = policy.network.metadata, STANCES[path.stem]
+    network = Network(path)
+    meta, holds = network.metadata, HOLDS[path.stem]
     assert meta["mode"] == path.stem
-    assert meta["default_pose"] == pytest.approx(stance.pose.tolist(), abs=1e-6)
+    assert meta["default_pose"] == pytest.approx(holds.pose.tolist(), abs=1e-6)
+    assert network.command == COMMANDS.get(path.stem, ())
     assert meta["training_command"].startswith("python train/ppo.py ")
     assert f"--mode {path.stem}" in meta["training_command"]
     assert isinstance(meta["training_seed"], int)
     assert meta["training_config_sha256"] == config_hash(meta["training_config"])
     assert not re.search(r"(^|[\s=\"'])(/|[A-Z]:\\)\w", json.dumps(meta)), "a path of somebody's machine"
-    x = stance.state()[None]
-    k = torch.zeros(1, dtype=torch.long)
-    action, _ = policy.act(x, x[:, 7:19], policy.reset(x, x[:, 7:19], k), k)
-    assert action.isfinite().all()
+    x = holds.state()[None]
+    told = np.zeros((1, len(network.command))) if network.command else None
+    action = network.act(x.numpy(), x[:, 7:19].numpy(), anchor_of(x).numpy(), told)
+    assert np.isfinite(action).all()

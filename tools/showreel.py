@@ -128,16 +128,16 @@ class Course:
 
 
 def laid_down(seed: int) -> tuple[Tensor, Tensor]:
-    """A robot that lies on one of its sides: state (37,) and last input (12,)."""
+    """A robot laid on a side, from where some roll onto their back: state (37,) and last input (12,)."""
     generator = torch.Generator().manual_seed(seed)
     left, roll, yaw, *joints = (2 * torch.rand(15, generator=generator, dtype=torch.float64) - 1).tolist()
     x = torch.zeros(37, dtype=torch.float64)
-    half = 0.5 * (math.copysign(math.pi / 2, left) + 0.3 * roll)
+    half = 0.5 * math.copysign(math.pi / 2 - 0.2 + 0.1 * roll, left)
     rolled = torch.tensor([[math.cos(half), math.sin(half), 0.0, 0.0]], dtype=torch.float64)
     turned = torch.tensor([[math.cos(math.pi / 2 * yaw), 0.0, 0.0, math.sin(math.pi / 2 * yaw)]]).double()
     x[3:7] = go2.product(turned, rolled)[0]
-    x[7:19] = (go2.HOME + 0.4 * torch.tensor(joints)).clamp(go2.Q_LOWER, go2.Q_UPPER)
-    x[2] = 0.25
+    x[7:19] = (go2.HOME + 0.2 * torch.tensor(joints)).clamp(go2.Q_LOWER, go2.Q_UPPER)
+    x[2] = 0.01 - go2.lowest(x[None])[0]
     u = x[7:19].clone()
     robot = Robots(MODEL, x[None], u[None], seed=seed)
     for _ in range(round(SETTLE / go2.DT)):

@@ -105,14 +105,8 @@ def disturbed(x: Tensor, cfg: LegsStartsCfg) -> Tensor:
     x[:, 7:19] = (x[:, 7:19] + cfg.joints * uniform(n, 12)).clamp(go2.Q_LOWER.to(x), go2.Q_UPPER.to(x))
     x[:, 19:25] += cfg.speed * uniform(n, 6)
     x[:, 25:37] += cfg.speed * uniform(n, 12)
-    x[:, 2] += 0.001 - lowest(x)
+    x[:, 2] += 0.001 - go2.lowest(x)
     return x
-
-
-def lowest(x: Tensor) -> Tensor:
-    """Height of the lowest point of the robot [m], (n,), at states x (n, 37)."""
-    gap = go2.clearances(x)
-    return torch.cat([gap["foot"], gap["thigh"], gap["calf"], gap["hip"], gap["trunk"][:, None]], 1).amin(1)
 
 
 def dropped(n: int, threads: int = 0) -> Tensor:
@@ -125,7 +119,7 @@ def dropped(n: int, threads: int = 0) -> Tensor:
     turn = torch.randn(n, 4)
     x[:, 3:7] = turn / turn.norm(dim=1, keepdim=True)
     x[:, 7:19] = go2.Q_LOWER + (go2.Q_UPPER - go2.Q_LOWER) * torch.rand(n, 12)
-    x[:, 2] += 0.1 - lowest(x)
+    x[:, 2] += 0.1 - go2.lowest(x)
     u = (x[:, 7:19] + 0.5 * torch.randn(n, 12)).clamp(go2.Q_LOWER, go2.Q_UPPER)
     sim = MujocoSim(go2.load_model(), n, threads=threads)
     sim.reset(x, u)

@@ -208,3 +208,9 @@ def clearances(x: Tensor) -> dict[str, Tensor]:
         "hip": height[:, None] + root + HIP_CENTRE / HIP_LENGTH * out * lean - 0.046,
         "trunk": (height[:, None] + tx * px + ty * py + tz * pz - radius).amin(1),
     }
+
+
+def lowest(x: Tensor) -> Tensor:
+    """Height of the lowest point of the robot [m], (n,), at states x (n, 37)."""
+    gap = clearances(x)
+    return torch.cat([gap["foot"], gap["thigh"], gap["calf"], gap["hip"], gap["trunk"][:, None]], 1).amin(1)
