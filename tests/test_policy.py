@@ -19,6 +19,7 @@ from hmc.go2.network import LOWER, UPPER, Network
 from hmc.go2.observe import anchor_of, observe
 from hmc.go2.policy import Policy
 from hmc.go2.stances import HANDSTAND, HOLDS
+from hmc.go2.torch_network import TorchNetwork
 from tests.tiny import CFG, make_runner
 from train.config import ROOT, config_hash, portable
 from train.export import actor_of, export
@@ -92,6 +93,34 @@ def test_the_same_bits_in_a_batch_of_any_size(exported):
         assert torch.equal(run(policy, obs[:n]), whole[:n])
         assert torch.equal(run(policy, obs[-n:]), whole[-n:])
     assert torch.equal(run(Policy(exported, threads=2), obs), whole)
+
+
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)
+def test_the_file_in_torch_does_what_it_does_in_onnxruntime(path):
+    """What runs on a GPU, on the CPU: the network's output, and the targets of the whole mode."""
+    network = Network(path)
+    obs = observations(1000)
+    obs = torch.cat([obs, torch.randn(1000, len(network.command))], 1)
+    found = TorchNetwork(path, torch.device("cpu"))(obs)
+    torch.testing.assert_close(found, torch.from_numpy(network.run(obs.numpy())), atol=1e-5, rtol=1e-5)
+    told = 0.3 * torch.randn(100, len(network.command)).double()
+    policy = Policy(path, command=(lambda x, k: told) if network.command else None)
+    x = HOLDS[network.mode].state().repeat(100, 1) + 0.05 * torch.randn(100, 37).double()
+    x[:, 3:7] /= x[:, 3:7].norm(dim=1, keepdim=True)
+    u, k = x[:, 7:19] + 0.1, torch.zeros(100, dtype=torch.long)
+    memory = policy.reset(x, u, k)
+    x[:, :2] += 0.2
+    expected, _ = policy.act(x, u, memory, k)
+    actual = policy.on_device(x, u, memory, *([told] if network.command else []))
+    torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
+
+
+def test_an_operation_that_torch_is_not_told_of(exported, tmp_path):
+    model = onnx.load(str(exported))
+    next(node for node in model.graph.node if node.op_type == "Sigmoid").op_type = "Tanh"
+    onnx.save(model, str(tmp_path / "odd.onnx"))
+    with pytest.raises(ValueError, match=r"odd\.onnx: operation Tanh .*: run it on the CPU"):
+        TorchNetwork(tmp_path / "odd.onnx", torch.device("cpu"))
 
 
 def test_the_mode(exported):

@@ -64,6 +64,8 @@ class Network:
         path: of the file.
         metadata: its contract, see `hmc.go2.facts.contract`, and how it was made.
         mode: its name there.
+        pose: joint positions that its targets are about [rad], (12,).
+        scale: of its output [rad].
         command: names and units of the numbers that it is commanded by, after the observation; mostly none.
 
     Args:
@@ -95,8 +97,8 @@ class Network:
             raise ValueError(f"policy {self.path}: {wrong}")
         self.mode = str(self.metadata["mode"])
         self.command = tuple(self.metadata.get("command", ()))
-        self._pose = np.array(self.metadata["default_pose"], dtype=np.float64)
-        self._scale = float(self.metadata["action_scale"])
+        self.pose = np.array(self.metadata["default_pose"], dtype=np.float64)
+        self.scale = float(self.metadata["action_scale"])
 
     def act(self, x: Array, u: Array, anchor: Array, command: Array | None = None) -> NDArray[np.float64]:
         """Joint targets [rad], (n, 12); arguments as of `observe`, and the command (n, c) if it obeys one."""
@@ -105,7 +107,7 @@ class Network:
             obs[:, 3:5] = 0.0
             obs = np.concatenate([obs, command], 1)
         output = self.run(obs.astype(np.float32))
-        target = self._pose + self._scale * output.astype(np.float64)
+        target = self.pose + self.scale * output.astype(np.float64)
         return np.minimum(np.maximum(target, LOWER), UPPER)
 
     def run(self, obs: NDArray[np.float32]) -> NDArray[np.float32]:

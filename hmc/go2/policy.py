@@ -1,4 +1,4 @@
-"""Learned modes: an ONNX file that carries its contract, run by onnxruntime."""
+"""Learned modes: an ONNX file that carries its contract, run by onnxruntime or, on a GPU, by torch."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from hmc.go2.network import Network
-from hmc.go2.observe import anchor_of
+from hmc.go2.network import LOWER, UPPER, Network
+from hmc.go2.observe import anchor_of, observe
+from hmc.go2.torch_network import TorchNetwork
 from hmc.modes import Mode
 
 
@@ -50,12 +51,38 @@ class Policy(Mode):
             got = "none is given" if command is None else "one is given"
             raise ValueError(f"policy {path}: it obeys {wants}, and {got}: see the argument command")
         self.command = command
+        self._devices: dict[torch.device, OnDevice] = {}
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
         return anchor_of(x)
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-        # in numpy: for few worlds a torch operation takes several times as long
         told = () if self.command is None else (self.command(x, k),)
-        target = self.network.act(*(each.cpu().numpy() for each in (x, u, memory, *told)))
+        if x.device.type != "cpu":
+            return self.on_device(x, u, memory, *told), memory
+        # in numpy: for few worlds a torch operation takes several times as long
+        target = self.network.act(*(each.numpy() for each in (x, u, memory, *told)))
         return torch.from_numpy(target).to(x), memory
+
+    def on_device(self, x: Tensor, u: Tensor, anchor: Tensor, command: Tensor | None = None) -> Tensor:
+        """Joint targets [rad], (n, 12), as of `Network.act`, without leaving the device of x (n, 37)."""
+        if x.device not in self._devices:
+            self._devices[x.device] = OnDevice(self.network, x.device)
+        here = self._devices[x.device]
+        obs = observe(x, u, anchor)
+        if command is not None:
+            obs[:, 3:5] = 0.0
+            obs = torch.cat([obs, command.to(obs)], 1)
+        output = here.network(obs.float()).double()
+        return torch.clamp(here.pose + self.network.scale * output, here.lower, here.upper).to(x)
+
+
+class OnDevice:
+    """A policy's network, and what its targets are made of, on a device."""
+
+    @torch.inference_mode(False)
+    def __init__(self, network: Network, device: torch.device):
+        self.network = TorchNetwork(network.path, device)
+        self.pose, self.lower, self.upper = (
+            torch.from_numpy(each).to(device) for each in (network.pose, LOWER, UPPER)
+        )
