@@ -30,6 +30,7 @@ class SearchCfg:
         moves: further draws beside each batch that move a stretch of the schedule.
         draws: switches that a tick's search may draw.
         control_steps: control steps that it may roll out.
+        seconds: wall-clock time that it may take [s]; 0 for any.
     """
 
     samples: int = 16
@@ -38,10 +39,11 @@ class SearchCfg:
     moves: int = 0
     draws: int = 16
     control_steps: int = 8000
+    seconds: float = 0.0
 
     def options(self) -> dict[str, Any]:
         """Arguments of `Receding`."""
-        budget = Budget(draws=self.draws, control_steps=self.control_steps)
+        budget = Budget(self.draws, self.control_steps, self.seconds or None)
         return {
             "samples": self.samples,
             "order": self.order,

@@ -25,7 +25,8 @@ from train.config import ROOT, config_hash, portable
 from train.export import actor_of, export
 from train.runner import read_checkpoint
 
-COMMITTED = sorted(Path(str(resources.files("hmc.go2"))).glob("policies/*.onnx"))
+FILES = Path(str(resources.files("hmc.go2"))) / "policies"
+COMMITTED = sorted(path for path in FILES.glob("*.onnx") if not path.stem.endswith("_value"))
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from hmc.go2.facts import OBS_SIZE
 from hmc.go2.mirror import mirror_joints, mirror_observation
 from hmc.go2.observe import anchor_of, observe
 from hmc.go2.stances import Stance, Stand
+from hmc.go2.value import seen
 from hmc.sim.base import Sim
 
 Gap = dict[str, Tensor]
@@ -171,7 +172,7 @@ class Go2Env(VecEnv):
         if len(self.mirror):  # what obeys commands goes far from where it was entered
             clean[:, 3:5] = noisy[:, 3:5] = 0.0
         torque = go2.motor_torque(self._x[:, 7:19], self._x[:, 25:37], self._u - self._zeros)
-        critic = torch.cat([clean, self.command, 0.1 * torque, self._x[:, 2:3]], -1)
+        critic = seen(torch.cat([clean, self.command], -1), torque, self._x[:, 2])
         policy = torch.cat([noisy, self.command], -1)
         return TensorDict({"policy": policy, "critic": critic}, batch_size=[self.num_envs])
 

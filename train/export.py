@@ -27,60 +27,71 @@ from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.facts import COMMANDS, OBS_SIZE, contract  # noqa: E402
 from hmc.go2.network import Network  # noqa: E402
 from hmc.go2.stances import HOLDS  # noqa: E402
+from hmc.go2.value import VALUE_EXTRA, Value  # noqa: E402
 from train.config import config_hash, portable  # noqa: E402
 from train.runner import read_checkpoint  # noqa: E402
 
 
 def actor_of(checkpoint: dict[str, Any]) -> MLPModel:
     """The actor network of a checkpoint, in evaluation mode."""
-    state = checkpoint["actor_state_dict"]
+    noise = dict(class_name="GaussianDistribution", init_std=1.0, std_type="log")
+    return _network(checkpoint["actor_state_dict"], "policy", 12, distribution_cfg=noise)
+
+
+def critic_of(checkpoint: dict[str, Any]) -> MLPModel:
+    """The critic network of a checkpoint, in evaluation mode."""
+    return _network(checkpoint["critic_state_dict"], "critic", 1)
+
+
+def _network(state: dict[str, Tensor], sees: str, outputs: int, **settings: Any) -> MLPModel:
     layers = [
         value.shape[0] for key, value in state.items() if key.startswith("mlp") and key.endswith("weight")
     ]
-    obs = TensorDict({"policy": torch.zeros(1, state["mlp.0.weight"].shape[1])}, batch_size=[1])
-    actor = MLPModel(
+    obs = TensorDict({sees: torch.zeros(1, state["mlp.0.weight"].shape[1])}, batch_size=[1])
+    network = MLPModel(
         obs,
-        {"actor": ["policy"]},
-        "actor",
-        12,
+        {"network": [sees]},
+        "network",
+        outputs,
         hidden_dims=layers[:-1],
         activation="swish",
         obs_normalization=True,
-        distribution_cfg=dict(class_name="GaussianDistribution", init_std=1.0, std_type="log"),
+        **settings,
     )
-    actor.load_state_dict(state)
-    return actor.eval()
+    network.load_state_dict(state)
+    return network.eval()
 
 
 class _Deterministic(nn.Module):
-    """The mean action of an observation batch."""
+    """The mean action, or the value, of an observation batch."""
 
-    def __init__(self, actor: MLPModel):
+    def __init__(self, network: MLPModel):
         super().__init__()
-        self.net = actor.as_onnx(verbose=False).eval()
+        self.net = network.as_onnx(verbose=False).eval()
 
     def forward(self, obs: Tensor) -> Tensor:
         return self.net(obs)
 
 
-def export(checkpoint: Path, out: Path) -> None:
-    """Write `out`; it appears only when complete and checked."""
+def export(checkpoint: Path, out: Path, *, value: bool = False) -> None:
+    """Write the policy of a checkpoint, or its value, to `out`; it appears only when complete and checked."""
     data = read_checkpoint(checkpoint)
     meta = data["infos"]["meta"]
     config = portable(json.loads(meta["config"]))
     mode = config["env"]["mode"]
     command = COMMANDS.get(mode, ())
-    module = _Deterministic(actor_of(data)).eval()
+    module = _Deterministic(critic_of(data) if value else actor_of(data)).eval()
+    size = OBS_SIZE + len(command) + (VALUE_EXTRA if value else 0)
     partial = out.with_suffix(".partial.onnx")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
     with redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch about itself
         torch.onnx.export(
             module,
-            (torch.zeros(2, OBS_SIZE + len(command)),),
+            (torch.zeros(2, size),),
             str(partial),
             input_names=["obs"],
-            output_names=["actions"],
+            output_names=["value" if value else "actions"],
             dynamic_shapes=({0: torch.export.Dim("batch")},),
             external_data=False,
             dynamo=True,
@@ -90,6 +101,7 @@ def export(checkpoint: Path, out: Path) -> None:
     fields = {
         **contract(),
         "mode": mode,
+        "value": value,
         "command": list(command),
         "default_pose": [round(float(v), 6) for v in HOLDS[mode].pose],
         "action_scale": config["env"]["action_scale"],
@@ -102,18 +114,18 @@ def export(checkpoint: Path, out: Path) -> None:
     del model.metadata_props[:]
     for part in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
         del part.metadata_props[:]  # stack traces, with the folders of this machine
-    for key, value in fields.items():
-        model.metadata_props.add(key=key, value=json.dumps(value))
+    for key, entry in fields.items():
+        model.metadata_props.add(key=key, value=json.dumps(entry))
     onnx.save(model, str(partial))
-    Network(partial)  # refuses what it would refuse later
+    (Value if value else Network)(partial)  # refuses what it would refuse later
     os.replace(partial, out)
 
 
-def main(checkpoint: Path, out: Path, /) -> None:
-    """Export CHECKPOINT (written by train/ppo.py) to OUT."""
+def main(checkpoint: Path, out: Path, /, value: bool = False) -> None:
+    """Export CHECKPOINT (written by train/ppo.py) to OUT: the policy, or its critic with --value."""
     with one_line_errors():
         out.parent.mkdir(parents=True, exist_ok=True)
-        export(checkpoint, out)
+        export(checkpoint, out, value=value)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 

@@ -78,23 +78,9 @@ class Network:
 
     def __init__(self, path: str | Path, threads: int = 1):
         self.path = Path(path)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        # idle threads of the network must not spin on the cores that step worlds
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        if not self.path.is_file():
-            raise ValueError(f"policy {self.path}: no such file")
-        try:
-            self._session = onnxruntime.InferenceSession(
-                str(self.path), options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:
-            raise ValueError(f"policy {self.path}: not a readable ONNX file ({error})") from error
-        fields = self._session.get_modelmeta().custom_metadata_map
-        self.metadata = {key: _decoded(text) for key, text in fields.items()}
-        if wrong := facts.disagreement(self.metadata):
-            raise ValueError(f"policy {self.path}: {wrong}")
+        self._session, self.metadata = opened(self.path, threads)
+        if self.metadata.get("value"):
+            raise ValueError(f"policy {self.path}: it is the value of one: export it without --value")
         self.mode = str(self.metadata["mode"])
         self.command = tuple(self.metadata.get("command", ()))
         self.pose = np.array(self.metadata["default_pose"], dtype=np.float64)
@@ -114,6 +100,29 @@ class Network:
         """The network's output, (n, 12), for observations with their commands (n, 48 + c)."""
         (output,) = self._session.run(None, {"obs": obs})
         return np.asarray(output)
+
+
+def opened(path: Path, threads: int) -> tuple[onnxruntime.InferenceSession, dict[str, Any]]:
+    """A file that train/export.py wrote, and its metadata.
+
+    Raises:
+        ValueError: the file cannot be read, or a field of its contract does not match; names it.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # idle threads of the network must not spin on the cores that step worlds
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    if not path.is_file():
+        raise ValueError(f"policy {path}: no such file")
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise ValueError(f"policy {path}: not a readable ONNX file ({error})") from error
+    metadata = {key: _decoded(text) for key, text in session.get_modelmeta().custom_metadata_map.items()}
+    if wrong := facts.disagreement(metadata):
+        raise ValueError(f"policy {path}: {wrong}")
+    return session, metadata
 
 
 def _decoded(text: str) -> Any:

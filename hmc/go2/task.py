@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from hmc.go2 import model as go2
 from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STAND
+from hmc.go2.value import Value
 from hmc.modes import Mode, ModeSet, Motion
 from hmc.rules import Rules
 from hmc.sampling import SamplingCfg, SamplingMpc
@@ -41,6 +42,8 @@ class CostCfg:
         pose: of exp(-|q - q_default|^2), as printed.
         tail: the terminal cost is the height, orientation and joint terms at the end, held for this
             long [s]. Without it a fall now is better than a flip that ends just behind the horizon.
+        value: of what the last state lacks to the value that the target's policy puts on its stance at rest,
+            as a share of that; see `hmc.go2.value`. Only a task's own cost has it, not that of its jump.
     """
 
     height: float = 1.5
@@ -50,6 +53,7 @@ class CostCfg:
     energy: float = 0.003
     pose: float = 2.5e-7
     tail: float = 1.0
+    value: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,8 @@ class FlipCfg:
         substeps: physics steps a control step of the planner's model; the robot's own has 4.
         iterations: of the contact solver in the planner's model, at most; None for the robot's own.
         ensemble: other models that schedules are judged on as well.
+        idle: further modes that this task has no use for, to see what they cost the search: of stand, getup
+            (policies), home and crouch (joint positions held).
     """
 
     horizon: int = 75
@@ -104,6 +110,7 @@ class FlipCfg:
     substeps: int = go2.SUBSTEPS
     iterations: int | None = None
     ensemble: EnsembleCfg = field(default_factory=EnsembleCfg)
+    idle: tuple[Literal["stand", "getup", "home", "crouch"], ...] = ()
 
 
 def timeline(command: int) -> Callable[[Tensor], Tensor]:
@@ -155,6 +162,29 @@ def stance_cost(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> Cost:
         "pose": pose,
     }
     return Cost(stage, {"tail": tail}, nonnegative=True)
+
+
+def with_values(cost: Cost, weight: float, hand: Callable[[Tensor], Tensor], threads: int = 1) -> Cost:
+    """A cost that ends with what the last state lacks in value; arguments as of `stance_cost`."""
+    foot, other = (Value(policy_path(f"{name}_value"), threads) for name in ("footstand", "handstand"))
+
+    def value(x: Tensor, k: Tensor) -> Tensor:
+        target = hand(k)
+        lack = torch.zeros(len(x), dtype=x.dtype, device=x.device)
+        for worth, rows in ((foot, (~target).nonzero()[:, 0]), (other, target.nonzero()[:, 0])):
+            if len(rows):
+                lack[rows] = (1.0 - worth(x[rows])).clamp(min=0.0)
+        return weight * lack
+
+    return Cost(cost.stage, {**cost.terminal, "value": value}, nonnegative=cost.nonnegative)
+
+
+def _idle_mode(name: str, threads: int) -> Mode:
+    """A mode that the flip has no use for, see `FlipCfg.idle`."""
+    held = {"home": go2.HOME, "crouch": torch.tensor((0.0, 1.3, -2.6) * 4)}
+    if name in held:
+        return Motion(name, held[name].double()[None])
+    return Policy(policy_path(name), name=name, threads=threads)
 
 
 @cache
@@ -237,9 +267,12 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
             Policy(policy_path("footstand", cfg.foot), name="foot", threads=threads),
             jump_mode(cfg.jump, sim, seed),
             Policy(policy_path("handstand", cfg.hand), name="hand", threads=threads),
+            *(_idle_mode(name, threads) for name in cfg.idle),
         ]
     )
     cost = stance_cost(cfg.cost, timeline(cfg.command))
+    if cfg.cost.value > 0:
+        cost = with_values(cost, cfg.cost.value, timeline(cfg.command), threads)
     others = make_ensemble(cfg.ensemble, seed=seed, **coarse)
     rules = Rules(dwell={"jump": cfg.jump.dwell}) if cfg.jump.dwell > 0 else None
     return Task("flip", modes, cost, cfg.horizon, sim, rules=rules, ensemble=others)
