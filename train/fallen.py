@@ -14,6 +14,7 @@ from train.env import Start
 
 STANDING, FALLEN, STANCES = range(3)
 SETTLE = 60  # control steps in which a dropped robot comes to rest
+ROLL = 5.0  # rad/s, at most, with which it is dropped
 
 
 @dataclass(frozen=True)
@@ -22,12 +23,12 @@ class LegsStartsCfg:
 
     Attributes:
         standing: share that begins on four feet, disturbed.
-        fallen: share that begins as a robot lies that was dropped in any attitude.
+        fallen: share that begins as a robot falls or lies that was dropped in any attitude.
         stances: share that begins in the foot stand or the handstand, disturbed.
         tilt: disturbance of roll and pitch, uniform [rad].
         speed: of linear [m/s] and angular [rad/s] velocity, uniform.
         joints: of joint positions, uniform [rad].
-        drops: robots that are dropped; their final states are what `fallen` draws from.
+        drops: robots that are dropped; their states are what `fallen` draws from.
     """
 
     standing: float = 1.0
@@ -110,20 +111,24 @@ def disturbed(x: Tensor, cfg: LegsStartsCfg) -> Tensor:
 
 
 def dropped(n: int, threads: int = 0) -> Tensor:
-    """States and inputs (n, 37 + 12) of robots that were dropped in any attitude and lie, most of them
-    at rest.
+    """States and inputs (n, 37 + 12) of robots that were dropped, in any attitude and rolling.
 
-    They hold any pose on the way: joints uniform over their ranges, targets not far from it.
+    Half of them lie there, most at rest; the others are taken at any moment on the way: from their sides, and
+    while they roll, a policy learns what one on its back has to reach. They hold any pose: joints uniform
+    over their ranges, targets not far from them.
     """
     x = torch.zeros(n, 37)
     turn = torch.randn(n, 4)
     x[:, 3:7] = turn / turn.norm(dim=1, keepdim=True)
     x[:, 7:19] = go2.Q_LOWER + (go2.Q_UPPER - go2.Q_LOWER) * torch.rand(n, 12)
     x[:, 2] += 0.1 - go2.lowest(x)
+    x[:, 22] = ROLL * (2 * torch.rand(n) - 1)
     u = (x[:, 7:19] + 0.5 * torch.randn(n, 12)).clamp(go2.Q_LOWER, go2.Q_UPPER)
     sim = MujocoSim(go2.load_model(), n, threads=threads)
     sim.reset(x, u)
-    for _ in range(SETTLE):
+    moment = torch.randint(1, 2 * SETTLE, (n,)).clamp(max=SETTLE)
+    for step in range(SETTLE):
         sim.step(u)
-    rows = torch.cat([sim.x().float(), u], 1)
+        x[moment == step + 1] = sim.x()[moment == step + 1].float()
+    rows = torch.cat([x, u], 1)
     return rows[rows.isfinite().all(1)]
