@@ -77,13 +77,17 @@ class WarpSim:
     device they are exact. That device is for parity tests: 8 times slower than one thread of the
     C engine at 256 worlds, 150 times at 5.
 
+    Attributes:
+        contacts: room for contacts, per world but pooled over the worlds of a workspace.
+        constraints: room for constraint rows of each world.
+
     Args:
         model: compiled model.
         num_worlds: number of worlds W.
         device: "cuda", "cuda:1", "cpu", or a torch device.
         substeps: physics steps a control step.
-        contacts: room for contacts, per world but pooled over the worlds of a workspace.
-        constraints: room for constraint rows of each world.
+        contacts: None for all that the geoms can make at once.
+        constraints: None for what so many contacts and all limits come to.
         deterministic: same bits in every run on a GPU, somewhat slower; None for what torch is set to
             (`torch.use_deterministic_algorithms`).
         latency: physics steps of a control step in which the input before it still acts; one of all worlds
@@ -130,8 +134,8 @@ class WarpSim:
         if deterministic and self._device.type == "cuda":
             self._params.opt.deterministic = mjw.DeterminismType.ALL
         most = most_contacts(model, self._params.nxn_geom_pair_filtered.numpy())
-        self._contacts = most if contacts is None else contacts
-        self._constraints = most_constraints(model, self._contacts) if constraints is None else constraints
+        self.contacts = most if contacts is None else contacts
+        self.constraints = most_constraints(model, self.contacts) if constraints is None else constraints
         # what a world has of its own besides its state: columns that go into a workspace with it
         own = {} if models is None else own_values(model, models)
         self._varied = tuple(own)
@@ -235,7 +239,7 @@ class WarpSim:
     def _space(self, size: int) -> Workspace:
         if size not in self._spaces:
             with wp.ScopedDevice(self._on_warp):
-                room = {"nconmax": self._contacts, "njmax": self._constraints}
+                room = {"nconmax": self.contacts, "njmax": self.constraints}
                 check_memory(mjw.make_data(self.model, nworld=1, **room), size, self._device)
                 data = mjw.make_data(self.model, nworld=size, **room)
                 params = with_fields(self._params, self._varied, size)
