@@ -110,6 +110,8 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert [path.name for path in out.parent.iterdir()] == ["figures.json"]
     said = " ".join(capsys.readouterr().out.split())
     assert f"bench {name}" in said
+    if name == "growth":  # the incumbent, and from each start the tails of each duration
+        assert written["exact_t4_control_steps"] == 4 + 2 * (4 + 3 * 2 + 2 * 3 + 1 * 4)
     if name == "gpu":
         assert "there is only cpu" in said
         assert "what ran instead is a tiny size on Warp's CPU device" in said
