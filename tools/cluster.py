@@ -24,7 +24,7 @@ def join(address: str, cores: int) -> None:
         cores: of this machine that a cluster of its own takes.
 
     Raises:
-        ValueError: Ray is not installed, no cluster answers, or it is of another version.
+        ValueError: Ray is not installed, no cluster answers or starts, or it is of another version.
     """
     try:
         import ray
@@ -49,7 +49,7 @@ def join(address: str, cores: int) -> None:
             if address != "auto":
                 raise
             ray.init("local", num_cpus=cores, include_dashboard=False, **quiet)
-    except (OSError, RuntimeError, ValueError) as error:
+    except Exception as error:  # of any kind: Ray raises the bare one, too
         raise ValueError(
             f"no Ray cluster to work on at {address} ({error}): start its head with 'ray start --head' and "
             "name it as HOST:PORT, or leave --ray out: processes of this machine do the work then"
