@@ -48,12 +48,26 @@ def join(address: str, cores: int) -> None:
         except ConnectionError:
             if address != "auto":
                 raise
-            ray.init("local", num_cpus=cores, include_dashboard=False, **quiet)
+            _start(cores, **quiet)
     except Exception as error:  # of any kind: Ray raises the bare one, too
         raise ValueError(
             f"no Ray cluster to work on at {address} ({error}): start its head with 'ray start --head' and "
             "name it as HOST:PORT, or leave --ray out: processes of this machine do the work then"
         ) from error
+
+
+def _start(cores: int, attempts: int = 3, **quiet: Any) -> None:
+    """Start a cluster of this machine; Ray gives up after half a minute, which a busy one may need twice."""
+    import ray
+
+    for attempt in range(attempts):
+        try:
+            ray.init("local", num_cpus=cores, include_dashboard=False, **quiet)
+            return
+        except Exception:
+            ray.shutdown()
+            if attempt == attempts - 1:
+                raise
 
 
 def on_ray(work: Callable[[Any], Any], todo: Sequence[Any]) -> Generator[Any]:
