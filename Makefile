@@ -12,7 +12,7 @@ READY := $(VENV)/ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INSTALL := $(PIP) install -q --no-compile -c constraints.txt # modules compile when first imported
 TORCH := $(shell grep '^torch==' constraints.txt)
-EXTRAS := warp,train,demo,deploy,sdk,dev
+EXTRAS := warp,train,demo,deploy,sdk,ray,dev
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-deploy lint format ci clean

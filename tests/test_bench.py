@@ -7,10 +7,13 @@ import math
 from pathlib import Path
 
 import pytest
+import torch
 
 from tools.bench import main
 from tools.benchmarks.engine import Engine
 from tools.benchmarks.figures import Common, Figures
+from tools.benchmarks.gpu import Gpu
+from tools.benchmarks.growth import Growth
 from tools.benchmarks.planner import Planner
 from tools.benchmarks.train import Train
 from tools.benchmarks.wire import Wire
@@ -42,6 +45,28 @@ SMALL = {
         Planner(threads=1, horizon=6, cartpole_horizon=10, samples=16, ticks=1, repeats=1),
         {"us_per_candidate", "cartpole_exact_ms", "cartpole_converged_ms"},
     ),
+    "gpu": (
+        Gpu(threads=1),
+        {
+            "step_4_efficiency",
+            "step_4_bare_steps_per_s",
+            "arrays_4_kb",
+            "env_4_efficiency",
+            "train_4_steps_per_s",
+            "exact_t3_ms",
+            "exact_t3_efficiency",
+            "exact_t3_candidates_per_s",
+            "exact_t3_c_ms",
+            "mppi_4x6_ms",
+        },
+    ),
+    "growth": (
+        Growth(threads=1, horizons=(3, 4), modes=(2,), samples=(4,), worlds=(2,), repeats=1),
+        {
+            *("exact_t3_control_steps", "exact_t4_ms", "exact_m2_ms", "batch_4_ms"),
+            "worlds_2_steps_per_s",
+        },
+    ),
     "wire": (
         Wire(threads=1, repeats=20, messages=20),
         {"crc_us", "state_decode_us", "robot_share", "round_trip_ms_p50", "answered"},
@@ -53,6 +78,8 @@ SMALL = {
 def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if name == "wire":
         pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
+    if name == "gpu" and torch.cuda.is_available():
+        pytest.skip("sizes for Warp's CPU device, and there is a GPU")
     args, expected = SMALL[name]
     out = tmp_path / "new" / "figures.json"
     if name == "planner":  # with policies that have learned nothing, so that the Go2's part runs everywhere
@@ -81,7 +108,13 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert all(math.isfinite(value) and value > 0 for value in figures.values()), figures
     assert {"cpu", "cores", "threads", "torch", "mujoco"} <= set(written["machine"])
     assert [path.name for path in out.parent.iterdir()] == ["figures.json"]
-    assert f"bench {name}" in capsys.readouterr().out
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"bench {name}" in said
+    if name == "growth":  # the incumbent, and from each start the tails of each duration
+        assert written["exact_t4_control_steps"] == 4 + 2 * (4 + 3 * 2 + 2 * 3 + 1 * 4)
+    if name == "gpu":
+        assert "there is only cpu" in said
+        assert "what ran instead is a tiny size on Warp's CPU device" in said
 
 
 def test_a_share_of_the_time_is_a_share(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from hmc.go2.model import clearances, load_model
-from hmc.go2.variants import Variant
 from hmc.sim.base import Sim, rollout
 from hmc.sim.cartpole import CartpoleSim
 from hmc.sim.make import make_sim
@@ -241,26 +240,6 @@ def test_inputs_come_late(latency):
     ids = index(late, 3, 0, 4)
     assert torch.equal(rollout(late, u[:, ids].transpose(0, 1), ids).transpose(0, 1), reached[:, ids])
     assert torch.equal(late.save(ids), after[ids])
-
-
-def test_worlds_of_their_own():
-    """Each with its model and its latency: the same as in a simulator that has these in all worlds."""
-    late, models = (
-        (2, 0, 4, 2, 1),
-        [Variant(friction=0.4 + 0.2 * i, payload=0.5 * i).model() for i in range(W)],
-    )
-    mixed = MujocoSim(load_model(), W, threads=1, latency=late, models=models)
-    u = 4 * inputs(mixed, 5) - 3 * rest(mixed)
-    restart(mixed)
-    states = run(mixed, u)
-    restart(mixed)
-    ids = index(mixed, 3, 0, 4)
-    assert torch.equal(rollout(mixed, u[:, ids].transpose(0, 1), ids).transpose(0, 1), states[:, ids])
-    for world in range(W):
-        alone = MujocoSim(models[world], W, threads=1, latency=late[world])
-        restart(alone)
-        assert torch.equal(run(alone, u)[:, world], states[:, world])
-    assert not torch.equal(states[-1, 0], states[-1, 3])
 
 
 def test_a_rollout_that_is_given_up_is_not_a_number():

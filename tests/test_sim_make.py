@@ -80,8 +80,8 @@ def test_sizes(model):
             ValueError, match=f"latency must be 0 to 4 .* {worlds}; got {re.escape(str(latency))}"
         ):
             MujocoSim(model, worlds, latency=latency)
-    with pytest.raises(ValueError, match="engine warp has one model in all worlds and no latency yet"):
-        make_sim(model, 1, "warp", device="cpu", latency=1)
+    with pytest.raises(ValueError, match=r"latency must be 0 to 4 .* 2; got 5"):
+        make_sim(model, 2, "warp", device="cpu", latency=5)
     with pytest.raises(ValueError, match="substeps must be at least 1, got 0"):
         make_sim(model, 1, "warp", device="cpu", substeps=0)
 

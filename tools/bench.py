@@ -1,4 +1,4 @@
-"""How fast it is: `python tools/bench.py engine|train|planner|wire [--json FILE]`.
+"""How fast it is: `python tools/bench.py engine|train|planner|wire|growth|gpu [--json FILE]`.
 
 Ratios are taken between two ways of doing the same work that take turns within one run, so that they mean
 something on a busy machine too; rates a second do only on an idle one. What is compared is checked to have
@@ -19,13 +19,15 @@ from rich.console import Console
 
 from tools.benchmarks.engine import Engine, engine
 from tools.benchmarks.figures import cores, machine
+from tools.benchmarks.gpu import Gpu, gpu
+from tools.benchmarks.growth import Growth, growth
 from tools.benchmarks.planner import Planner, planner
 from tools.benchmarks.train import Train, train
 from tools.benchmarks.wire import Wire, wire
 from tools.study import write_json
 
 
-def main(args: Engine | Train | Planner | Wire) -> int:
+def main(args: Engine | Train | Planner | Wire | Growth | Gpu) -> int:
     """Measure, print, write."""
     threads = args.threads or cores()
     args = replace(args, threads=threads)
@@ -42,6 +44,10 @@ def main(args: Engine | Train | Planner | Wire) -> int:
             figures = planner(args)
         case Wire():
             figures = wire(args)
+        case Growth():
+            figures = growth(args)
+        case Gpu():
+            figures = gpu(args)
     console = Console()
     console.print(figures.table(f"bench {name}"))
     for key, note in figures.notes.items():
@@ -55,4 +61,4 @@ def main(args: Engine | Train | Planner | Wire) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Engine | Train | Planner | Wire)))
+    sys.exit(main(tyro.cli(Engine | Train | Planner | Wire | Growth | Gpu)))

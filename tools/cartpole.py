@@ -24,17 +24,15 @@ from tools.cartpole_study import Job, Row, StudyCfg, jobs, optimum, search, work
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(study.Workers):
     """Command line.
 
     Attributes:
         out: folder to write to; a study that was stopped goes on from what is there.
-        processes: jobs that run at the same time, a core each; 0 for as many as there are cores.
         set: overrides of cfg/cartpole.toml, such as seeds=2.
     """
 
     out: Path = ROOT / "out" / "cartpole"
-    processes: int = 0
     set: tuple[str, ...] = ()
 
 
@@ -44,7 +42,7 @@ def main(args: Args) -> int:
     with one_line_errors():
         cfg = load(ROOT / "cfg" / "cartpole.toml", StudyCfg, args.set)
         table = study.folder_of(args.out, cfg) / "results.csv"
-    rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args.processes, console)
+    rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args, console)
     if rows is None:
         return 1
     cartpole_figures.gaps(args.out / "gap.png", rows, cfg)

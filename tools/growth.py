@@ -201,18 +201,15 @@ def draw(path: Path, cfg: GrowthCfg, found: dict[str, list[dict[str, float]]]) -
 
 
 @dataclass(frozen=True)
-class Args:
-    """Command line.
+class Args(study.Workers):
+    """Command line. Times a tick mean something only on cores that nothing else uses.
 
     Attributes:
-        out: folder to write to.
-        processes: runs at the same time, a core each; 0 for as many as there are cores. Times a tick mean
-            something only on cores that nothing else uses.
+        out: folder to write to; a study that was stopped goes on from what is there.
         set: overrides of cfg/growth.toml, such as trials=1.
     """
 
     out: Path = ROOT / "out" / "growth"
-    processes: int = 0
     set: tuple[str, ...] = ()
 
 
@@ -225,7 +222,7 @@ def main(args: Args) -> int:
             settings(cfg, Job(factor.name, factor.values[0], 0))  # what is wrong with a key shows here
         folder = study.folder_of(args.out, cfg)
     console = Console()
-    rows = study.carry_out(partial(work, cfg), jobs(cfg), folder / "rows.csv", Row, args.processes, console)
+    rows = study.carry_out(partial(work, cfg), jobs(cfg), folder / "rows.csv", Row, args, console)
     if rows is None:
         return 1
     found = points(cfg, rows)

@@ -77,17 +77,15 @@ def draw(path: Path, sweeps: dict[str, dict[str, list[int]]]) -> None:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(study.Workers):
     """Command line.
 
     Attributes:
         out: folder to write to; a test that was stopped goes on from what is there.
-        processes: runs at the same time, a core each; 0 for as many as there are cores.
         set: overrides of cfg/robustness.toml, such as trials=10; with flip. before it, of cfg/flip.toml.
     """
 
     out: Path = ROOT / "out" / "robustness"
-    processes: int = 0
     set: tuple[str, ...] = ()
 
 
@@ -98,7 +96,7 @@ def main(args: Args) -> int:
         cfg = study_cfg(ROOT / "cfg" / "robustness.toml", RobustnessCfg, args.set)
         flip_task(cfg.flip.task)  # what is wrong with a policy file shows here
         table = study.folder_of(args.out, cfg) / "results.csv"
-    rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args.processes, console)
+    rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args, console)
     if rows is None:
         return 1
     summary = summarise(rows)

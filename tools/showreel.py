@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
 import time
 from dataclasses import dataclass, field, replace
@@ -31,7 +30,7 @@ from hmc.go2.stances import HOLDS  # noqa: E402
 from hmc.receding import SearchCfg  # noqa: E402
 from tools import figures, render  # noqa: E402
 from tools.closed_loop import MODEL, RunCfg, study_cfg  # noqa: E402
-from tools.study import run_all, write_json  # noqa: E402
+from tools.study import Workers, run_all, write_json  # noqa: E402
 
 ARRIVED = 0.3  # m: so near to its place a robot is there
 DOWN = 0.5  # s on the ground, where it should not be, and the course begins anew
@@ -224,14 +223,13 @@ def table(runs: list[Reel], goals: int) -> Table:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Workers):
     """Command line.
 
     Attributes:
         seeds: number of runs.
         first_seed: seed of the first.
         out: folder to write to.
-        processes: seeds that run at the same time, a core each; 0 for as many as there are cores.
         video: render a video of each run, if OpenGL is there.
         set: overrides of cfg/showreel.toml, such as search.draws=8.
     """
@@ -239,7 +237,6 @@ class Args:
     seeds: int = 10
     first_seed: int = 0
     out: Path = ROOT / "out" / "showreel"
-    processes: int = 0
     video: bool = True
     set: tuple[str, ...] = ()
 
@@ -254,7 +251,7 @@ def main(args: Args) -> int:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     runs: list[Reel] = []
     try:
-        for done in run_all(partial(reel, cfg), seeds, args.processes or os.cpu_count() or 1, console):
+        for done in run_all(partial(reel, cfg), seeds, args, console):
             runs.append(done)
             write_reel(args.out, done, cfg, args.video, console)
     except KeyboardInterrupt:

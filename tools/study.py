@@ -1,22 +1,26 @@
-"""Studies: jobs on all cores, their results in a table that grows, and a stopped study that goes on."""
+"""Studies: jobs on all cores or machines, results in a table that grows, and a stopped study that goes on."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, get_type_hints
+from typing import Annotated, Any, Protocol, TypeVar, get_type_hints
 
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+from tyro.constructors import PrimitiveConstructorSpec
 
 from hmc.cfg import dump
+from hmc.cli import one_line_errors
+from tools import cluster
 
 PARSERS: dict[Any, Callable[[str], Any]] = {str: str, int: int, float: float, bool: "True".__eq__}
 
@@ -32,7 +36,34 @@ class Row(Protocol):
 
 
 R = TypeVar("R", bound=Row)
-S = TypeVar("S")
+
+# --ray alone or with an address; a str, empty without one
+ADDRESS = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="[ADDRESS]",
+    instance_from_str=" ".join,
+    is_instance=lambda value: isinstance(value, str),
+    str_from_instance=lambda address: [address] if address else [],
+)
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who works on the jobs of a study; a part of a command line.
+
+    Attributes:
+        processes: jobs at the same time on this machine, a core each; 0 for as many as there are cores.
+        ray: work on a Ray cluster instead, a core a job: that at an address such as 10.0.0.1:6379; without
+            one, the cluster that this machine is part of, or else one of this machine alone.
+    """
+
+    processes: int = 0
+    ray: Annotated[str, ADDRESS] | None = None
+
+    @property
+    def cores(self) -> int:
+        """Jobs at the same time on this machine."""
+        return self.processes or os.cpu_count() or 1
 
 
 def folder_of(out: Path, cfg: Any) -> Path:
@@ -51,28 +82,36 @@ def folder_of(out: Path, cfg: Any) -> Path:
     return folder
 
 
+def _itself(row: Any) -> Any:
+    return row
+
+
 def carry_out(
-    work: Callable[[Any], R],
+    work: Callable[[Any], Any],
     jobs: Sequence[Any],
     table: Path,
     kind: Callable[..., R],
-    processes: int,
+    workers: Workers,
     console: Console,
+    receive: Callable[[Any], R] = _itself,
 ) -> list[R] | None:
     """Do what the table lacks; all rows in the order of the jobs, or None when stopped by Ctrl-C.
 
     Args:
-        work: what makes a row of a job, in a process of its own.
+        work: what makes a row of a job, in a process of its own that may be on another machine; a job whose
+            process was lost is worked on again.
         jobs: all of the study.
         table: .csv, whole at any time; rows in it are not made again.
         kind: of the rows.
-        processes: that work at the same time, a core each; 0 for as many as there are cores.
+        workers: who works.
         console: where progress is shown.
+        receive: what makes a row, in this process, where `work` returns more than that; files are written
+            here, because another machine has other folders.
     """
     rows = {row.job: row for row in read(table, kind)} if table.exists() else {}
     todo = [job for job in jobs if job not in rows]
     try:
-        for row in run_all(work, todo, processes or os.cpu_count() or 1, console):
+        for row in map(receive, run_all(work, todo, workers, console)):
             rows[row.job] = row
             write(table, [rows[job] for job in jobs if job in rows])
     except KeyboardInterrupt:
@@ -82,26 +121,37 @@ def carry_out(
     return [rows[job] for job in jobs]
 
 
-def run_all(work: Callable[[Any], S], todo: Sequence[Any], processes: int, console: Console) -> Iterator[S]:
-    """Results as they come, from a pool of processes."""
+def run_all(
+    work: Callable[[Any], Any], todo: Sequence[Any], workers: Workers, console: Console
+) -> Iterator[Any]:
+    """What comes of the jobs, as it comes."""
+    if not todo:
+        return
+    if workers.ray is None:
+        done = on_processes(work, todo, workers.cores)
+    else:
+        with one_line_errors():
+            cluster.join(workers.ray, workers.cores)
+        done = cluster.on_ray(work, todo)
     columns = (
         *Progress.get_default_columns()[:2],
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
+    with Progress(*columns, console=console) as bar, contextlib.closing(done):
+        yield from bar.track(done, total=len(todo), description="the study")
+
+
+def on_processes(work: Callable[[Any], Any], todo: Sequence[Any], processes: int) -> Generator[Any]:
+    """What comes of the jobs, as it comes, from a pool of processes."""
     context = multiprocessing.get_context("spawn")
-    with (
-        Progress(*columns, console=console) as bar,
-        ProcessPoolExecutor(processes, mp_context=context) as pool,
-    ):
-        shown = bar.add_task("the study", total=len(todo))
+    with ProcessPoolExecutor(processes, mp_context=context) as pool:
         waiting = {pool.submit(work, job) for job in todo}
         try:
             while waiting:
                 ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in ended:
-                    bar.advance(shown)
                     yield future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -31,6 +31,7 @@ from tools.table2_study import (  # noqa: E402
     Rule,
     Table2Cfg,
     jobs,
+    keep,
     sequences,
     switches,
     tune,
@@ -91,17 +92,15 @@ def cells(name: str, values: dict[str, Any]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(study.Workers):
     """Command line.
 
     Attributes:
         out: folder to write to; a study that was stopped goes on from what is there.
-        processes: runs at the same time, a core each; 0 for as many as there are cores.
         set: overrides of cfg/table2.toml, such as trials=2; with flip. before it, of cfg/flip.toml.
     """
 
     out: Path = ROOT / "out" / "table2"
-    processes: int = 0
     set: tuple[str, ...] = ()
 
 
@@ -114,8 +113,8 @@ def main(args: Args) -> int:
         folder = study.folder_of(args.out, cfg)
     (folder / "runs").mkdir(exist_ok=True)
     rules = tuned(cfg, folder / "rules.json", console)
-    do = partial(work, cfg, rules, folder / "runs")
-    rows = study.carry_out(do, jobs(cfg), folder / "results.csv", Row, args.processes, console)
+    do, receive = partial(work, cfg, rules), partial(keep, folder / "runs")
+    rows = study.carry_out(do, jobs(cfg), folder / "results.csv", Row, args, console, receive)
     if rows is None:
         return 1
     summary = summarise(rows)

@@ -194,20 +194,14 @@ def controller(cfg: Table2Cfg, rules: dict[str, Rule], job: Job) -> tuple[Contro
     return chosen(task.modes, lambda x, k: task.modes.names[int(follow(x[None], k))]), task
 
 
-def work(cfg: Table2Cfg, rules: dict[str, Rule], folder: Path, job: Job) -> Row:
-    """One run, on one core; its states, modes and cost terms go into `folder`."""
+def work(cfg: Table2Cfg, rules: dict[str, Rule], job: Job) -> tuple[Row, dict[str, np.ndarray]]:
+    """One run, on one core; and its states, modes and cost terms."""
     torch.set_num_threads(1)
     control, task = controller(cfg, rules, job)
     done = run(control, task.cost, cfg.flip, job.seed)
-    target = folder / f"{job.controller}_{job.seed}.npz"
-    partial = target.with_suffix(".partial.npz")
-    np.savez_compressed(
-        partial, x=done.x.float().numpy(), modes=np.array(done.modes), terms=done.terms.float().numpy()
-    )
-    os.replace(partial, target)
     steps = float(np.mean([entry["control_steps"] for entry in done.log]))
     stages = done.stages
-    return Row(
+    row = Row(
         job,
         stages.foot_stand,
         stages.jump_flip,
@@ -216,3 +210,15 @@ def work(cfg: Table2Cfg, rules: dict[str, Rule], folder: Path, job: Job) -> Row:
         steps,
         float(done.plan_ms.mean()),
     )
+    arrays = {"x": done.x.float().numpy(), "modes": np.array(done.modes), "terms": done.terms.float().numpy()}
+    return row, arrays
+
+
+def keep(folder: Path, made: tuple[Row, dict[str, np.ndarray]]) -> Row:
+    """Write what a run was into `folder`; its row."""
+    row, arrays = made
+    target = folder / f"{row.job.controller}_{row.job.seed}.npz"
+    partial = target.with_suffix(".partial.npz")
+    np.savez_compressed(partial, allow_pickle=False, **arrays)
+    os.replace(partial, target)
+    return row

@@ -1,4 +1,4 @@
-"""Train a learned mode: `python train/ppo.py --mode handstand`."""
+"""Train a learned mode: `python train/ppo.py --mode handstand`, by torchrun on several GPUs."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ class Args:
         device: of engine and networks, such as cpu or cuda:0; auto takes a GPU if there is one.
         threads: of the C engine and of torch; 0 for all cores.
         seed: of everything random.
+        deterministic: the same seed gives the same policy on a GPU, too, somewhat slower; on a CPU with one
+            number of threads it always does.
         out: folder for checkpoints and logs; default out/train/MODE or out/train/MODE_STAGE.
         resume: go on from the latest checkpoint in `out`, or from the file given by --checkpoint.
         checkpoint: a file to begin from (weights, optimiser, curriculum).
@@ -47,6 +49,7 @@ class Args:
     device: str = "auto"
     threads: int = 0
     seed: int = 1
+    deterministic: bool = False
     out: Path | None = None
     resume: bool = False
     checkpoint: Path | None = None
@@ -66,13 +69,25 @@ class Args:
 
 
 def under_torchrun(args: Args) -> Args:
-    """Under torchrun each process has a GPU and a seed of its own; else the arguments as they are."""
+    """Under torchrun each process has a GPU and a seed of its own; else the arguments as they are.
+
+    Raises:
+        ValueError: there is not a GPU for each process of this machine.
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return args
+    gpus, processes = torch.cuda.device_count(), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if not torch.cuda.is_available():
         raise ValueError(
             "torchrun starts one process a GPU and there is none here: run python train/ppo.py alone"
         )
+    if processes > gpus:
+        raise ValueError(
+            f"torchrun starts one process a GPU, {processes} processes here for {gpus}: take "
+            f"--nproc-per-node={gpus}"
+        )
+    if args.device != "auto":
+        raise ValueError(f"torchrun gives each process a GPU of its own: leave --device {args.device} out")
     rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
     return replace(args, device=f"cuda:{local}", seed=args.seed + 1000 * rank)
 
@@ -82,6 +97,10 @@ def set_up(args: Args) -> Runner:
     cfg = read_training(args.mode, args.name, args.set)
     args = under_torchrun(args)
     torch.manual_seed(args.seed)
+    if args.deterministic:
+        # the engine follows torch; cuBLAS wants this set before its first call
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True, warn_only=True)
     if args.threads:
         torch.set_num_threads(args.threads)
     device = None if args.device == "auto" else args.device
@@ -101,9 +120,10 @@ def set_up(args: Args) -> Runner:
 
 def train(runner: Runner, folder: Path) -> None:
     """Train to the last iteration, or until Ctrl-C."""
-    first = runner.current_learning_iteration
+    first, alone = runner.current_learning_iteration, not runner.is_distributed
+    say = print if runner.gpu_global_rank == 0 else str  # one of torchrun's processes talks
     if first >= runner.last_iteration:
-        print(f"{first} iterations are done already: ask for more with --iterations")
+        say(f"{first} iterations are done already: ask for more with --iterations")
         return
     folder.mkdir(parents=True, exist_ok=True)
     with runner.table.live or contextlib.nullcontext():
@@ -112,7 +132,10 @@ def train(runner: Runner, folder: Path) -> None:
         except KeyboardInterrupt:
             done = runner.save_interrupted()
             note = f"go on with --resume (checkpoint in {folder})" if done else "nothing was learned yet"
-            print(f"stopped; {note}")
+            say(f"stopped; {note}")
+        finally:
+            if not alone:
+                torch.distributed.destroy_process_group()
 
 
 def main(args: Args) -> None:

@@ -171,7 +171,8 @@ class LiveTable:
     def __init__(self, runner: Runner):
         self.runner = runner
         self.console = Console()
-        self.live = Live(console=self.console, refresh_per_second=2) if self.console.is_terminal else None
+        shown = self.console.is_terminal and not runner.logger.disable_logs
+        self.live = Live(console=self.console, refresh_per_second=2) if shown else None
         self.printed = 0.0
 
     def update(self, log: dict[str, Any], extras: list[dict[str, Any]]) -> None:

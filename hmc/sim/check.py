@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -28,3 +30,18 @@ def check(worlds: int, ids: Ids, **arrays: tuple[Tensor, int]) -> None:
     for name, (array, width) in arrays.items():
         if array.shape != (n, width):
             raise ValueError(f"{name} must be ({n}, {width}): a row a world, got {tuple(array.shape)}")
+
+
+def check_latency(latency: int | Sequence[int], worlds: int, substeps: int) -> list[int]:
+    """Physics steps by which the inputs of each world come late, from one of all worlds or one of each.
+
+    Raises:
+        ValueError: not one a world, or not within a control step of so many physics steps.
+    """
+    late = [latency] * worlds if isinstance(latency, int) else list(latency)
+    if len(late) != worlds or not 0 <= min(late) <= max(late) <= substeps:
+        raise ValueError(
+            f"latency must be 0 to {substeps} physics steps, a control step, one of all worlds or one of "
+            f"each of the {worlds}; got {latency}"
+        )
+    return late

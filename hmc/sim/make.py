@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import metadata
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,6 +17,12 @@ if TYPE_CHECKING:
     from hmc.sim.base import Sim
 
 ENGINES = ("auto", "mujoco", "warp")
+
+
+def installed() -> str:
+    """The packages behind engine warp with their versions, in words."""
+    names = ("mujoco", "mujoco-warp", "warp-lang")
+    return ", ".join(f"{name} {metadata.version(name)}" for name in names)
 
 
 def make_sim(
@@ -38,8 +45,10 @@ def make_sim(
         device: where to simulate; left out, a GPU if there is one, unless the engine is "mujoco".
         substeps: physics steps a control step.
         threads: of the C engine; 0 for all cores.
-        latency: of the inputs, see `hmc.sim.mujoco.MujocoSim`; of the C engine only.
-        models: one of each world; of the C engine only.
+        latency: physics steps of a control step in which the input before it still acts; one of all worlds
+            or one of each.
+        models: a model of each world with other values than `model`, of which engine warp takes those in
+            `hmc.sim.variety.OWN`; None for `model` in all of them.
 
     Raises:
         ValueError: an engine that is not known, a device that does not exist, or the two do not fit.
@@ -60,10 +69,6 @@ def make_sim(
         return MujocoSim(
             model, num_worlds, substeps=substeps, threads=threads, latency=latency, models=models
         )
-    if models is not None or latency != 0:
-        raise ValueError(
-            "engine warp has one model in all worlds and no latency yet: take engine mujoco for other ones"
-        )
     if there is None and not torch.cuda.is_available():
         raise ValueError(f"engine warp wants a GPU and {devices()}: take engine mujoco, its fast CPU sibling")
     try:
@@ -72,4 +77,11 @@ def make_sim(
         raise ValueError(
             f"engine warp needs {error.name}: pip install 'hmc[warp]', or take mujoco"
         ) from error
-    return WarpSim(model, num_worlds, device=there or "cuda", substeps=substeps)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"engine warp: {installed()} do not go together ({error}): pip install 'hmc[warp]' -c "
+            "constraints.txt for a tested set, or take engine mujoco"
+        ) from error
+    return WarpSim(
+        model, num_worlds, device=there or "cuda", substeps=substeps, latency=latency, models=models
+    )

@@ -11,7 +11,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from hmc.sim.check import check
+from hmc.sim.check import check, check_latency
 from hmc.sim.ids import Ids, fresh, where
 
 
@@ -47,12 +47,7 @@ class MujocoSim:
             raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, got {substeps}")
-        late = [latency] * num_worlds if isinstance(latency, int) else list(latency)
-        if len(late) != num_worlds or not 0 <= min(late) <= max(late) <= substeps:
-            raise ValueError(
-                f"latency must be 0 to {substeps} physics steps, a control step, one of all worlds or one of "
-                f"each of the {num_worlds}; got {latency}"
-            )
+        late = check_latency(latency, num_worlds, substeps)
         if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET:
             raise ValueError(
                 "the model resets diverged worlds by itself, which would hide them from the planner: "

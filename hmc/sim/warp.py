@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 import gc
+import warnings
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any
 
 import mujoco
@@ -11,9 +14,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hmc.sim.check import check
+from hmc.sim.check import check, check_latency
+from hmc.sim.cuda import check_memory, graphs
 from hmc.sim.device import find_device
 from hmc.sim.ids import Ids, count, fresh, where
+from hmc.sim.variety import own_values
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # not one line a compiled kernel
 
@@ -44,8 +49,16 @@ LOSSES = {
 }
 
 
+@wp.kernel
+def arrive(now: int, late: wp.array[float], inputs: wp.array2d[float], ctrl: wp.array2d[float]) -> None:
+    """Let the inputs act whose latency is over by physics step `now`."""
+    world, i = wp.tid()  # type: ignore[misc]
+    if late[world] <= float(now):
+        ctrl[world, i] = inputs[world, i]  # type: ignore[index]
+
+
 class WarpSim:
-    """W worlds of one MuJoCo model on `mujoco_warp`; see `hmc.sim.base.Sim`.
+    """W worlds of a MuJoCo model on `mujoco_warp`; see `hmc.sim.base.Sim`.
 
     x is qpos then qvel, u is ctrl, all float32 on `device`. Worlds live as rows of one torch tensor, so
     that save, load and reset are indexing on the device. A step copies the rows it is about into a
@@ -64,14 +77,23 @@ class WarpSim:
     device they are exact. That device is for parity tests: 8 times slower than one thread of the
     C engine at 256 worlds, 150 times at 5.
 
+    Attributes:
+        contacts: room for contacts, per world but pooled over the worlds of a workspace.
+        constraints: room for constraint rows of each world.
+
     Args:
         model: compiled model.
         num_worlds: number of worlds W.
         device: "cuda", "cuda:1", "cpu", or a torch device.
         substeps: physics steps a control step.
-        contacts: room for contacts, per world but pooled over the worlds of a workspace.
-        constraints: room for constraint rows of each world.
-        deterministic: same bits in every run on a GPU, somewhat slower.
+        contacts: None for all that the geoms can make at once.
+        constraints: None for what so many contacts and all limits come to.
+        deterministic: same bits in every run on a GPU, somewhat slower; None for what torch is set to
+            (`torch.use_deterministic_algorithms`).
+        latency: physics steps of a control step in which the input before it still acts; one of all worlds
+            or one of each.
+        models: a model of each world, which may differ from `model` in what `hmc.sim.variety.OWN` names;
+            None for `model` in all of them.
     """
 
     def __init__(
@@ -83,32 +105,43 @@ class WarpSim:
         substeps: int = 4,
         contacts: int | None = None,
         constraints: int | None = None,
-        deterministic: bool = False,
+        deterministic: bool | None = None,
+        latency: int | Sequence[int] = 0,
+        models: Sequence[mujoco.MjModel] | None = None,
     ):
         if num_worlds < 1:
             raise ValueError(f"num_worlds must be at least 1, got {num_worlds}")
         if substeps < 1:
             raise ValueError(f"substeps must be at least 1, got {substeps}")
+        late = check_latency(latency, num_worlds, substeps)
+        if models is not None and len(models) != num_worlds:
+            raise ValueError(f"models must be one of each of the {num_worlds} worlds, got {len(models)}")
         self._device = find_device(device)
         wp.init()
-        if self._device.type == "cuda" and not wp.is_cuda_available():
-            raise ValueError("torch finds a GPU but Warp does not: its CUDA needs a newer NVIDIA driver")
+        self._captured, loops = graphs(self._device)
         self._on_warp = wp.device_from_torch(self._device)
         self.model = copy.copy(model)
         # mujoco_warp never resets a diverged world, and refuses the flag that asks C MuJoCo not to
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._num_worlds, self._substeps = num_worlds, substeps
-        with wp.ScopedDevice(self._on_warp):
-            self._params = mjw.put_model(self.model)
+        with wp.ScopedDevice(self._on_warp), warnings.catch_warnings(action="ignore"):
+            self._params = mjw.put_model(self.model)  # its warning about drivers is several lines long
         self._params.opt.warn_overflow = 0  # counted below instead of printed by the device
         if self._device.type == "cuda":
-            # loops inside a graph need driver 12.4; without them the solver always runs to its last iteration
-            self._params.opt.graph_conditional = wp.is_conditional_graph_supported()
+            self._params.opt.graph_conditional = loops
+        if deterministic is None:
+            deterministic = torch.are_deterministic_algorithms_enabled()
         if deterministic and self._device.type == "cuda":
             self._params.opt.deterministic = mjw.DeterminismType.ALL
         most = most_contacts(model, self._params.nxn_geom_pair_filtered.numpy())
-        self._contacts = most if contacts is None else contacts
-        self._constraints = most_constraints(model, self._contacts) if constraints is None else constraints
+        self.contacts = most if contacts is None else contacts
+        self.constraints = most_constraints(model, self.contacts) if constraints is None else constraints
+        # what a world has of its own besides its state: columns that go into a workspace with it
+        own = {} if models is None else own_values(model, models)
+        self._varied = tuple(own)
+        columns = [torch.tensor(late)[:, None], *map(torch.from_numpy, own.values())]
+        self._own = torch.cat([values.flatten(1).float() for values in columns], 1).to(self._device)
+        self._arrivals = sorted({0, *late} - {substeps})  # physics steps that inputs come at
         self._spaces: dict[int, Workspace] = {}
         first = self._space(num_worlds)
         self._slices = first.slices
@@ -170,11 +203,10 @@ class WarpSim:
             return
         ids = where(ids)
         space = self._space(self._size(n))
-        row = fresh(self._rows, ids)
-        row[:, self._slices["ctrl"]] = u.to(row)
-        space.write(row)
+        space.write(fresh(self._rows, ids), fresh(self._own, ids), u)
         space.run()
         row = space.read()[:n]
+        row[:, self._slices["ctrl"]] = u.to(row)  # also where it comes only with the next step
         lost = torch.stack([space.overflow[:n] & int(bits) != 0 for bits in LOSSES.values()])
         self._lost += lost.sum(1)
         moving = slice(self._slices["qpos"].start, self._slices["qvel"].stop)
@@ -207,34 +239,58 @@ class WarpSim:
     def _space(self, size: int) -> Workspace:
         if size not in self._spaces:
             with wp.ScopedDevice(self._on_warp):
-                data = mjw.make_data(self.model, nworld=size, nconmax=self._contacts, njmax=self._constraints)
-            self._spaces[size] = Workspace(self._params, data, self._on_warp, self._substeps)
+                room = {"nconmax": self.contacts, "njmax": self.constraints}
+                check_memory(mjw.make_data(self.model, nworld=1, **room), size, self._device)
+                data = mjw.make_data(self.model, nworld=size, **room)
+                params = with_fields(self._params, self._varied, size)
+            self._spaces[size] = Workspace(
+                params, data, self._on_warp, self._substeps, self._varied, self._arrivals, self._captured
+            )
         return self._spaces[size]
 
 
 class Workspace:
     """A batch of worlds on the device that rows are copied into, stepped in, and copied out of."""
 
-    def __init__(self, params: Any, data: Any, device: Any, substeps: int):
-        self._params, self._data, self._device, self._substeps = params, data, device, substeps
-        self._views: dict[str, Tensor] = {}
-        self.slices: dict[str, slice] = {}
-        end = 0
-        for name in FIELDS:
-            view = wp.to_torch(getattr(data, name)).reshape(data.nworld, -1)
-            self._views[name] = view
-            self.slices[name] = slice(end, end + view.shape[1])
-            end += view.shape[1]
+    def __init__(
+        self,
+        params: Any,
+        data: Any,
+        device: Any,
+        substeps: int,
+        varied: Sequence[str],
+        arrivals: Sequence[int],
+        captured: bool,
+    ):
+        self._params, self._data, self._device = params, data, device
+        self._substeps, self._arrivals, self._captured = substeps, arrivals, captured
+        size = data.nworld
+        self._views = {name: wp.to_torch(getattr(data, name)).reshape(size, -1) for name in FIELDS}
+        self.slices = slices(self._views)
+        with wp.ScopedDevice(device):
+            self._late, self._inputs = wp.zeros(size, dtype=float), wp.zeros_like(data.ctrl)
+        # as in a row of what a world has of its own
+        self._own = {"late": wp.to_torch(self._late)[:, None]}
+        for name in varied:
+            self._own[name] = wp.to_torch(getattr(params, name)).reshape(size, -1)
+        self._own_slices = slices(self._own)
+        self._u = wp.to_torch(self._inputs)
         self.force = wp.to_torch(data.actuator_force)
         self.overflow = wp.to_torch(data.overflow)
         self._graph: Any = None
 
-    def write(self, rows: Tensor) -> None:
-        """Take rows (n, ns); the worlds beyond n copy the first, which costs less than strays would."""
-        n = len(rows)
-        for name, view in self._views.items():
-            view[:n] = rows[:, self.slices[name]]
-            view[n:] = rows[:1, self.slices[name]]
+    def write(self, rows: Tensor, own: Tensor, u: Tensor) -> None:
+        """Take rows (n, ns), what their worlds have of their own (n, no), and inputs (n, nu).
+
+        The worlds beyond n copy the first, which costs less than strays would.
+        """
+        for view, given in (
+            *((view, rows[:, self.slices[name]]) for name, view in self._views.items()),
+            *((view, own[:, self._own_slices[name]]) for name, view in self._own.items()),
+            (self._u, u),
+        ):
+            view[: len(given)] = given
+            view[len(given) :] = given[:1]
         self.overflow.zero_()
 
     def read(self) -> Tensor:
@@ -246,14 +302,21 @@ class Workspace:
         if not self._device.is_cuda:
             self._substep_all()
             return
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.force.device))  # no waiting in between
+        if not self._captured:
+            with wp.ScopedStream(stream):
+                self._substep_all()
+            return
         if self._graph is None:
             self._capture()
-        stream = torch.cuda.current_stream(self.force.device)
-        wp.capture_launch(self._graph, stream=wp.stream_from_torch(stream))  # torch's: no waiting in between
+        wp.capture_launch(self._graph, stream=stream)
 
     def _substep_all(self) -> None:
         with wp.ScopedDevice(self._device):
-            for _ in range(self._substeps):
+            for i in range(self._substeps):
+                if i in self._arrivals:
+                    ctrl = self._data.ctrl
+                    wp.launch(arrive, ctrl.shape, inputs=[i, self._late, self._inputs, ctrl])
                 mjw.step(self._params, self._data)
 
     def _capture(self) -> None:
@@ -269,7 +332,26 @@ class Workspace:
         finally:
             gc.enable()
         self._graph = capture.graph
-        self.write(rows)
+        for name, view in self._views.items():
+            view[:] = rows[:, self.slices[name]]
+        self.overflow.zero_()
+
+
+def slices(views: dict[str, Tensor]) -> dict[str, slice]:
+    """Where the columns of each are when they lie side by side."""
+    ends = list(accumulate(view.shape[1] for view in views.values()))
+    return {name: slice(begin, end) for name, begin, end in zip(views, [0, *ends], ends, strict=False)}
+
+
+def with_fields(params: Any, names: Sequence[str], worlds: int) -> Any:
+    """A model on the device in which every world has these values of its own; all others are shared."""
+    params = copy.copy(params)
+    for name in names:
+        shared = getattr(params, name)
+        field = wp.zeros((worlds, *shared.shape[1:]), dtype=shared.dtype)
+        field._is_batched = True  # as mujoco_warp marks those that it makes
+        setattr(params, name, field)
+    return params
 
 
 def most_contacts(model: mujoco.MjModel, pairs: Any) -> int:

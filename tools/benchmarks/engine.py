@@ -56,12 +56,15 @@ class Engine(Common):
 
 
 def take_turns(
-    ours: Callable[[], Iterator[None]], bare: Callable[[], Iterator[None]], args: Engine
+    ours: Callable[[], Iterator[None]],
+    bare: Callable[[], Iterator[None]],
+    repeats: int,
+    clock_of: str = "wall",
 ) -> np.ndarray:
     """Seconds of each side, (repeats, 2). They take turns at every `yield`; one repeat warms up."""
-    times = np.zeros((args.repeats, 2))
-    clock = time.perf_counter if args.clock == "wall" else time.process_time
-    for repeat in range(-1, args.repeats):
+    times = np.zeros((repeats, 2))
+    clock = time.perf_counter if clock_of == "wall" else time.process_time
+    for repeat in range(-1, repeats):
         sides = ours(), bare()
         for turn in itertools.count():
             more = True
@@ -134,7 +137,9 @@ def engine(args: Engine) -> Figures:
             sim.x()
             yield
 
-    times = take_turns(open_loop, lambda: bare.replay(rows.numpy(), targets.numpy()), args)
+    times = take_turns(
+        open_loop, lambda: bare.replay(rows.numpy(), targets.numpy()), args.repeats, args.clock
+    )
     same(sim.save().numpy(), bare.batch.state, "open loop")
     add_ratio(figures, "open_loop", times, physics_steps, f"{args.worlds} worlds, given targets")
 
@@ -172,7 +177,7 @@ def _policy_mode(
 
     deque(closed_loop(), maxlen=0)
     targets = applied.numpy().copy()
-    times = take_turns(closed_loop, lambda: bare.replay(rows.numpy(), targets), args)
+    times = take_turns(closed_loop, lambda: bare.replay(rows.numpy(), targets), args.repeats, args.clock)
     same(sim.save().numpy(), bare.batch.state, "policy mode")
     add_ratio(figures, "policy", times, args.worlds * args.steps * SUBSTEPS, f"{args.worlds} worlds, {words}")
 
@@ -211,7 +216,7 @@ def _evaluator(
             bare.batch.step(ids, nstep=SUBSTEPS)
         yield
 
-    times = take_turns(rollouts, whole, args)
+    times = take_turns(rollouts, whole, args.repeats, args.clock)
     last = steps[-1][0]
     same(sim.save().numpy()[last], bare.batch.state[last], "evaluator")
     made = sum(len(ids) for ids, _, _ in steps) * SUBSTEPS

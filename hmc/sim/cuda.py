@@ -1,0 +1,72 @@
+"""What a GPU must have for engine warp: drivers, graphs, memory. What lacks is said in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from typing import Any
+
+import torch
+import warp as wp
+
+
+def graphs(device: torch.device) -> tuple[bool, bool]:
+    """Whether steps can be captured as graphs on a device, and whether these can hold loops.
+
+    A warning says what is slower where they cannot. A CPU has neither and needs neither.
+
+    Raises:
+        ValueError: torch has this GPU and Warp has not.
+    """
+    if device.type == "cpu":
+        return False, False
+    if not wp.is_cuda_available():
+        raise ValueError(
+            f"engine warp: torch finds {device} but Warp {wp.config.version} does not, its CUDA "
+            "needs a newer NVIDIA driver: update that, or take engine mujoco"
+        )
+    captured = wp.is_mempool_supported(wp.device_from_torch(device))
+    loops = captured and wp.is_conditional_graph_supported()
+    if not loops:
+        version = ".".join(map(str, wp.get_cuda_driver_version() or ()))
+        instead = (
+            "the contact solver always runs to its last iteration" if captured else "each kernel starts alone"
+        )
+        lack = "loops in CUDA graphs, for which it needs 12.4" if captured else "memory pools in CUDA graphs"
+        warnings.warn(
+            f"engine warp is slower here: the driver of {device} (CUDA {version}) lacks {lack}; {instead}",
+            stacklevel=3,
+        )
+    return captured, loops
+
+
+def check_memory(one: Any, worlds: int, device: torch.device) -> None:
+    """Make sure that so many worlds fit on a device before they are made there.
+
+    Args:
+        one: the engine's data of one world.
+        worlds: to be made.
+        device: where.
+
+    Raises:
+        ValueError: less memory is free than they take at least.
+    """
+    free, each = free_memory(device), num_bytes(one)
+    if worlds * each > free:
+        raise ValueError(
+            f"{worlds:,} worlds take at least {worlds * each / 2**30:.2f} GiB on {device}, where "
+            f"{free / 2**30:.2f} GiB are free: take at most {int(free // each):,} worlds"
+        )
+
+
+def free_memory(device: torch.device) -> float:
+    """Bytes that are free on a device; without end on a CPU, which says for itself when it has no more."""
+    return float("inf") if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
+
+
+def num_bytes(data: Any) -> int:
+    """Bytes of all arrays of a mujoco_warp structure."""
+    values = [getattr(data, field.name) for field in dataclasses.fields(data)]
+    parts = [value for value in values if dataclasses.is_dataclass(value)]
+    arrays = [value for value in values if isinstance(value, wp.array)]
+    return sum(array.capacity for array in arrays) + sum(map(num_bytes, parts))

@@ -1,0 +1,171 @@
+"""Engine warp against C MuJoCo, contact forces included, and what it says where something lacks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from hmc.go2.model import SUBSTEPS, load_model
+from hmc.go2.variants import Variant
+from hmc.sim import cuda
+from hmc.sim.make import installed, make_sim
+from hmc.sim.warp import WarpSim
+
+WORLDS, STEPS = 64, 50
+TALL = torch.tensor([0.0, 0.8, -1.5] * 4)  # [rad]: the knees are well above the ground
+APART, FORCE_APART = 1e-3, 0.1  # see `test_standing_robots`
+
+
+def standing() -> torch.Tensor:
+    """Random states on four feet anywhere on the floor, in any direction, (WORLDS, 37)."""
+    generator = torch.Generator().manual_seed(5)
+    x = 0.02 * torch.randn(WORLDS, 37, generator=generator)
+    half = torch.pi * torch.rand(WORLDS, generator=generator)
+    x[:, :2] = 4 * torch.rand(WORLDS, 2, generator=generator) - 2
+    x[:, 2] = 0.333
+    x[:, 3:7] = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
+    x[:, 7:19] += TALL
+    return x
+
+
+def forces(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Contact force on each geom in the last physics step [N], (ngeom, 3), in world axes."""
+    found, force = np.zeros((model.ngeom, 3)), np.zeros(6)
+    for i, contact in enumerate(data.contact):
+        mujoco.mj_contactForce(model, data, i, force)
+        found[contact.geom[1]] += contact.frame.reshape(3, 3).T @ force[:3]
+    return found
+
+
+def warp_forces(sim: WarpSim) -> np.ndarray:
+    """The same of all worlds, (W, ngeom, 3)."""
+    space: Any = sim._space(sim.num_worlds)  # what is in it is of no use but to look into
+    params, data = space._params, space._data
+    n = int(data.nacon.numpy()[0])
+    force = wp.zeros((n,), dtype=wp.spatial_vector, device=params.geom_friction.device)  # type: ignore[call-overload]
+    ids: Any = wp.array(np.arange(n, dtype=np.int32), device=force.device)
+    mjw.contact_force(params, data, ids, True, force)
+    found = np.zeros((sim.num_worlds, sim.model.ngeom, 3))
+    at = data.contact.worldid.numpy()[:n], data.contact.geom.numpy()[:n, 1]
+    np.add.at(found, at, force.numpy()[:, :3])
+    return found
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_standing_robots(device, request):
+    """50 control steps of 64 robots on their feet against mj_step, whose float64 and float32 differ.
+
+    Of any entry of x (m, rad, m/s, rad/s) at any step by at most 1e-3, found were 3e-4; of any component of
+    the force on a foot, up to 104 N, by at most 0.1 N, found were 0.02 N.
+    """
+    if device == "cuda":
+        request.getfixturevalue("cuda")
+    model, x = load_model(), standing()
+    sim = WarpSim(model, WORLDS, device=device, deterministic=True)
+    u = TALL + 0.03 * torch.randn(STEPS // 5, WORLDS, 12, generator=torch.Generator().manual_seed(6))
+    worlds = [mujoco.MjData(model) for _ in range(WORLDS)]
+    for data, row in zip(worlds, x.double().numpy(), strict=True):
+        data.qpos, data.qvel = row[:19], row[19:]
+    sim.reset(x.to(device), TALL.repeat(WORLDS, 1).to(device))
+    for k in range(STEPS):
+        sim.step(u[k // 5].to(device))
+        for data, target in zip(worlds, u[k // 5].double().numpy(), strict=True):
+            data.ctrl = target
+            mujoco.mj_step(model, data, SUBSTEPS)
+        states = np.stack([np.concatenate([data.qpos, data.qvel]) for data in worlds])
+        assert np.abs(sim.x().cpu().double().numpy() - states).max() <= APART
+        if k % 5 == 4:
+            found, reference = warp_forces(sim), np.stack([forces(model, data) for data in worlds])
+            assert np.abs(found - reference).max() <= FORCE_APART
+    lift = found[..., 2].sum(1)
+    assert lift.mean() == pytest.approx(9.81 * model.body_mass.sum(), rel=0.1), "they stand"
+    assert sim.overflow() == {"constraints": 0, "contacts": 0}
+
+
+def test_other_models_are_checked():
+    model = load_model()
+    longer = load_model()
+    longer.geom_size[5, 1] *= 1.1
+    with pytest.raises(ValueError, match=r"differ in geom_size, .* they may in geom_friction, .*mujoco"):
+        make_sim(model, 2, "warp", device="cpu", models=[model, longer])
+    coarser = load_model()
+    coarser.opt.iterations = 3
+    with pytest.raises(ValueError, match=r"differ in opt\.iterations, "):
+        make_sim(model, 2, "warp", device="cpu", models=[model, coarser])
+    with pytest.raises(ValueError, match="models must be one of each of the 3 worlds, got 1"):
+        make_sim(model, 3, "warp", device="cpu", models=[Variant().model()])
+
+
+def test_memory_is_checked_before_it_is_taken(monkeypatch):
+    """What is free decides; the number that is offered fits."""
+    model, each = load_model(), 0
+    one = mjw.make_data(WarpSim(model, 1, device="cpu").model, nworld=1)
+    each = cuda.num_bytes(one)
+    assert each > 4 * sum(np.prod(value.shape) for value in (one.qpos, one.qvel, one.efc.J))
+    cuda.check_memory(one, 1000, torch.device("cpu"))
+    monkeypatch.setattr(cuda, "free_memory", lambda device: 10.5 * each)
+    cuda.check_memory(one, 10, torch.device("cpu"))
+    with pytest.raises(ValueError, match=r"11 worlds take at least .* GiB .*: take at most 10 worlds"):
+        cuda.check_memory(one, 11, torch.device("cpu"))
+    with pytest.raises(ValueError, match="4,096 worlds take at least"):
+        WarpSim(model, 4096, device="cpu")
+
+
+def fake_gpu(monkeypatch, *, warp: bool = True, pools: bool = True, loops: bool = True) -> torch.device:
+    """A device of torch's, of which Warp says this."""
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: warp)
+    monkeypatch.setattr(wp, "device_from_torch", lambda device: device)
+    monkeypatch.setattr(wp, "is_mempool_supported", lambda device: pools)
+    monkeypatch.setattr(wp, "is_conditional_graph_supported", lambda: loops)
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: (12, 2))
+    return torch.device("cuda", 0)
+
+
+def test_drivers(monkeypatch):
+    assert cuda.graphs(torch.device("cpu")) == (False, False)
+    assert cuda.graphs(fake_gpu(monkeypatch)) == (True, True)
+    with pytest.warns(UserWarning, match=r"CUDA 12\.2\) lacks loops .* 12\.4; the contact solver") as said:
+        assert cuda.graphs(fake_gpu(monkeypatch, loops=False)) == (True, False)
+    with pytest.warns(UserWarning, match=r"lacks memory pools in CUDA graphs; each kernel starts alone"):
+        assert cuda.graphs(fake_gpu(monkeypatch, pools=False)) == (False, False)
+    assert "\n" not in str(said[0].message)
+    with pytest.raises(ValueError, match=r"torch finds cuda:0 but Warp .* driver: .* engine mujoco"):
+        cuda.graphs(fake_gpu(monkeypatch, warp=False))
+
+
+def test_packages_that_lack_or_do_not_fit():
+    """In a program of its own, where nothing is loaded yet."""
+    program = """
+import sys
+from hmc.go2.model import load_model
+from hmc.sim.make import make_sim
+for module in (None, type(sys)("mujoco_warp")):
+    sys.modules["mujoco_warp"] = module
+    try:
+        make_sim(load_model(), 1, "warp", device="cpu")
+    except ValueError as error:
+        print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    lacking, misfit = done.stdout.splitlines()
+    assert lacking == "engine warp needs mujoco_warp: pip install 'hmc[warp]', or take mujoco"
+    assert f"{installed()} do not go together (module 'mujoco_warp' has no attribute" in misfit
+    assert "or take engine mujoco" in misfit
+
+
+def test_determinism_is_torchs(cuda):
+    """Without an argument of its own the engine is as deterministic as torch is set to be."""
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        sim: Any = WarpSim(load_model(), 1)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert sim._params.opt.deterministic == mjw.DeterminismType.ALL

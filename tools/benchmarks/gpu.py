@@ -1,0 +1,281 @@
+"""What engine warp brings on a GPU, beside the bare mujoco_warp: stepping, training, planning, memory."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from statistics import median
+from typing import Any
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from hmc import ModeSet, SwitchSpace, Task, plan
+from hmc.cfg import load
+from hmc.go2.model import HOME, Q_LOWER, Q_UPPER, SUBSTEPS, load_model
+from hmc.go2.policy import Policy
+from hmc.go2.task import flip_task, jump_mode, policy_path
+from hmc.sim.cuda import num_bytes
+from hmc.sim.device import devices
+from hmc.sim.make import make_sim
+from hmc.sim.warp import WarpSim
+from tools import closed_loop
+from tools.benchmarks.engine import add_ratio, same, take_turns
+from tools.benchmarks.figures import Common, Figures
+from tools.benchmarks.train import Train, iterations
+from train.config import ROOT, read_training
+from train.make import make_env
+
+# without a GPU: so little that Warp's CPU device gets through it
+TINY: dict[str, Any] = {
+    "worlds": (4,),
+    "steps": 2,
+    "repeats": 1,
+    "horizon": 3,
+    "samples": 4,
+    "plan_steps": 6,
+    "iterations": 1,
+    "set": ("ppo.steps=4", "ppo.hidden=[16]", "ppo.minibatches=2"),
+}
+
+
+@dataclass(frozen=True)
+class Gpu(Common):
+    """Engine warp on this machine's GPU; without one, a tiny run on Warp's CPU device that tests the path.
+
+    Attributes:
+        worlds: numbers of worlds to step and to train in.
+        steps: control steps of a repeat.
+        repeats: of what is timed.
+        horizon: of the search through all of Omega, with three policies as modes [control steps].
+        samples: of the MPPI update.
+        plan_steps: its horizon [control steps].
+        iterations: of training that count, after one that does not.
+        set: overrides of cfg/handstand.toml.
+    """
+
+    worlds: tuple[int, ...] = (4096, 8192)
+    steps: int = 50
+    repeats: int = 5
+    horizon: int = 75
+    samples: int = 4096
+    plan_steps: int = 40
+    iterations: int = 5
+    set: tuple[str, ...] = ()
+
+
+@torch.no_grad()
+def gpu(args: Gpu) -> Figures:
+    """Stepping, the environment, training, exact plans and MPPI on engine warp."""
+    figures, device = Figures(), "cuda"
+    if not torch.cuda.is_available():
+        args, device = replace(args, **TINY), "cpu"
+        figures.notes["gpu"] = (
+            f"{devices()}: what ran instead is a tiny size on Warp's CPU device, whose figures say "
+            "nothing of a GPU"
+        )
+    else:
+        figures.notes["gpu"] = (
+            f"on {torch.cuda.get_device_name()}, CUDA driver {wp.get_cuda_driver_version()}"
+        )
+    for worlds in args.worlds:
+        _stepping(figures, args, device, worlds)
+        _training(figures, args, device, worlds)
+    _planning(figures, args, device)
+    return figures
+
+
+class Bare:
+    """mujoco_warp alone, with a simulator's model and sizes: its step, captured where that can be."""
+
+    def __init__(self, sim: WarpSim):
+        self.device = wp.device_from_torch(sim.device)
+        with wp.ScopedDevice(self.device):
+            self.model = mjw.put_model(sim.model)
+            self.data = mjw.make_data(
+                sim.model, nworld=sim.num_worlds, nconmax=sim.contacts, njmax=sim.constraints
+            )
+        self.model.opt.warn_overflow = 0
+        self.qpos, self.qvel = wp.to_torch(self.data.qpos), wp.to_torch(self.data.qvel)
+        self.ctrl, self.graph = wp.to_torch(self.data.ctrl), None
+        if self.device.is_cuda:
+            self._substeps()  # kernels are compiled and loaded outside of the capture
+            wp.synchronize_device(self.device)
+            with wp.ScopedCapture(self.device) as capture:
+                self._substeps()
+            self.graph = capture.graph
+
+    def reset(self, x: Tensor) -> None:
+        """Begin at states (W, nx)."""
+        with wp.ScopedDevice(self.device):
+            mjw.reset_data(self.model, self.data)
+        finish(str(x.device))
+        self.qpos[:], self.qvel[:] = x[:, : self.qpos.shape[1]], x[:, self.qpos.shape[1] :]
+
+    def step(self, u: Tensor) -> None:
+        """One control step."""
+        self.ctrl[:] = u
+        if self.graph is None:
+            self._substeps()
+            return
+        stream = torch.cuda.current_stream(u.device)
+        wp.capture_launch(self.graph, stream=wp.stream_from_torch(stream))
+
+    def _substeps(self) -> None:
+        with wp.ScopedDevice(self.device):
+            for _ in range(SUBSTEPS):
+                mjw.step(self.model, self.data)
+
+
+def finish(device: str) -> None:
+    """Wait for the device; nothing to wait for on a CPU."""
+    if device != "cpu":
+        torch.cuda.synchronize()
+
+
+def seconds(work: Callable[[], Any], device: str, repeats: int) -> float:
+    """How long it takes, the median; once before that for what is captured and cached [s]."""
+    took = []
+    for _ in range(repeats + 1):
+        finish(device)
+        began = time.perf_counter()
+        work()
+        finish(device)
+        took.append(time.perf_counter() - began)
+    return median(took[1:])
+
+
+def _stepping(figures: Figures, args: Gpu, device: str, worlds: int) -> None:
+    """Given targets through the simulator, zero actions through the environment, against mjw.step alone."""
+    free = torch.cuda.mem_get_info()[0] if device != "cpu" else 0
+    sim = WarpSim(load_model(), worlds, device=device)
+    if device != "cpu":
+        sim.step(sim.u())
+        finish(device)
+        used = free - torch.cuda.mem_get_info()[0]
+        figures.add(f"memory_{worlds}_kb", used / worlds / 1024, "device memory a world, all included [KiB]")
+    alone = Bare(sim)
+    x = torch.zeros(worlds, 37, device=device)
+    x[:, 2], x[:, 3], x[:, 7:19] = 0.29, 1.0, HOME.to(x)
+    targets = HOME.to(x) + 0.1 * torch.randn(args.steps, worlds, 12, device=device)
+    targets = targets.clamp(Q_LOWER.to(x), Q_UPPER.to(x))
+    sim.reset(x, x[:, 7:19])
+    rows = sim.save()
+
+    def ours() -> Iterator[None]:
+        sim.load(rows)
+        for target in targets:
+            sim.step(target)
+            sim.x()
+        finish(device)
+        yield
+
+    def bare() -> Iterator[None]:
+        alone.reset(x)
+        for target in targets:
+            alone.step(target)
+        finish(device)
+        yield
+
+    physics = worlds * args.steps * SUBSTEPS
+    times = take_turns(ours, bare, args.repeats)
+    if device == "cpu":  # on a GPU the order of threads decides the last bits
+        deque(bare(), maxlen=0)
+        deque(ours(), maxlen=0)
+        same(sim.x().numpy(), torch.cat([alone.qpos, alone.qvel], 1).numpy(), "stepping")
+    add_ratio(figures, f"step_{worlds}", times, physics, f"{worlds:,} worlds, given targets")
+    figures.add(f"arrays_{worlds}_kb", num_bytes(alone.data) / worlds / 1024, "arrays of a world [KiB]")
+
+    cfg = read_training("handstand", "handstand", (*args.set, f"env.worlds={worlds}"))
+    env = make_env(cfg.env, "warp", device=device)
+
+    def environment() -> Iterator[None]:
+        for _ in targets:
+            env.step(torch.zeros(worlds, 12, device=device))
+        finish(device)
+        yield
+
+    times = take_turns(environment, bare, args.repeats)
+    add_ratio(figures, f"env_{worlds}", times, physics, f"{worlds:,} worlds, rewards and resets included")
+
+
+def _training(figures: Figures, args: Gpu, device: str, worlds: int) -> None:
+    """PPO, learning included."""
+    cfg = read_training("handstand", "handstand", (*args.set, f"env.worlds={worlds}"))
+    env = make_env(cfg.env, "warp", device=device)
+    with torch.enable_grad():
+        whole, *_ = iterations(Train(warm_up=1, iterations=args.iterations), cfg, env)
+    rate = worlds * cfg.ppo.steps / float(whole.mean())
+    figures.add(f"train_{worlds}_steps_per_s", rate, "environment steps/s, learning included")
+
+
+def _planning(figures: Figures, args: Gpu, device: str) -> None:
+    """All of Omega, policies as modes, on warp and on the C engine; one MPPI update."""
+    cfg = load(ROOT / "cfg" / "flip.toml", closed_loop.RunCfg)
+    task = flip_task(cfg.task, threads=args.threads)
+    third = Policy(policy_path("handstand", cfg.task.hand), name="again", threads=args.threads)
+    modes = ModeSet([task.modes["foot"], task.modes["hand"], third])
+    small = replace(task, modes=modes, horizon=args.horizon, rules=None)
+    x, u = closed_loop.disturbed_start(cfg.start, 0)
+    size = len(SwitchSpace(3, args.horizon))
+    worlds, found = max(args.worlds), {}
+    for engine in ("warp", "mujoco"):
+        on = {"device": device} if engine == "warp" else {"threads": args.threads}
+        sim = make_sim(load_model(), worlds, engine, **on)
+        solve = partial(exact, small, sim, x.to(sim.device, sim.dtype), u.to(sim.device, sim.dtype), size)
+        found[engine] = 1e3 * seconds(solve, device, args.repeats)
+        result = solve()
+        if engine == "warp":
+            name = f"exact_t{args.horizon}"
+            rate = result.control_steps * SUBSTEPS / (found[engine] / 1e3)
+            bare = figures.values[f"step_{worlds}_bare_steps_per_s"]
+            figures.add(
+                f"{name}_efficiency", rate / bare, "physics steps/s of the search over the bare engine's"
+            )
+            figures.add(f"{name}_candidates_per_s", 1e3 * result.draws / found[engine], "schedules a second")
+            figures.add(
+                f"{name}_ms", found[engine], f"the best of {size:,} switches, M 3, three policies [ms]"
+            )
+    figures.add(
+        f"exact_t{args.horizon}_c_ms",
+        found["mujoco"],
+        f"the same on the C engine, {args.threads} threads [ms]",
+    )
+    knots = min(cfg.task.jump.sampling.knots, args.plan_steps)
+    settings = replace(
+        cfg.task.jump.sampling,
+        samples=args.samples,
+        horizon=args.plan_steps,
+        replan_every=args.plan_steps,
+        worlds=args.samples,
+        knots=knots,
+    )
+    mpc = jump_mode(
+        replace(cfg.task.jump, sampling=settings),
+        lambda n: make_sim(load_model(), n, "warp", device=device),
+        seed=0,
+    )
+    one = [row[None].to(device, torch.float32) for row in (x, u)]
+    update = partial(replan, mpc, one[0], one[1], iter(range(10**6)))
+    figures.add(
+        f"mppi_{args.samples}x{args.plan_steps}_ms",
+        1e3 * seconds(update, device, args.repeats),
+        "an MPPI update of so many samples and control steps [ms]",
+    )
+
+
+def exact(task: Task, sim: Any, x: Tensor, u: Tensor, size: int) -> Any:
+    """The single-switch problem from a foot stand, solved exactly."""
+    foot = ["foot"] * task.horizon
+    return plan(task, x, u=u, schedule=foot, solver="exhaustive", samples=size, iterations=1, sim=sim)
+
+
+def replan(mpc: Any, x: Tensor, u: Tensor, steps: Iterator[int]) -> None:
+    """One update at a control step at which there was none yet, so that none is remembered."""
+    k = torch.tensor([next(steps)], device=x.device)
+    mpc.act(x, u, mpc.reset(x, u, k), k)
