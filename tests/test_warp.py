@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
 import mujoco
 import mujoco_warp as mjw
@@ -13,7 +14,11 @@ import pytest
 import torch
 import warp as wp
 
+from hmc import plan
+from hmc.go2.ensemble import EnsembleCfg
 from hmc.go2.model import SUBSTEPS, load_model
+from hmc.go2.stances import FOOTSTAND
+from hmc.go2.task import FlipCfg, JumpCfg, flip_task
 from hmc.go2.variants import Variant
 from hmc.sim import cuda
 from hmc.sim.make import installed, make_sim
@@ -169,3 +174,18 @@ def test_determinism_is_torchs(cuda):
     finally:
         torch.use_deterministic_algorithms(False)
     assert sim._params.opt.deterministic == mjw.DeterminismType.ALL
+
+
+def test_a_flip_is_planned_on_it():
+    """The same search as on the C engine, with policies and an ensemble, at the same cost to rounding."""
+    jump = JumpCfg(guess=((-0.2, -2.0, 3.0, -1.7), (0.2, -1.1, 1.1, -0.8)), mpc=False)
+    cfg = FlipCfg(horizon=3, command=2, jump=jump, ensemble=EnsembleCfg(members=1))
+    x = FOOTSTAND.state()
+    plans = {}
+    engines: list[tuple[Literal["mujoco", "warp"], str]] = [("mujoco", ""), ("warp", "cpu")]
+    for engine, device in engines:
+        task = flip_task(replace(cfg, engine=engine, device=device), threads=1)
+        plans[engine] = plan(task, x, u=x[7:19], solver="exhaustive", samples=18)
+    assert plans["warp"].schedule == plans["mujoco"].schedule
+    assert plans["warp"].cost == pytest.approx(plans["mujoco"].cost, rel=1e-3)
+    assert plans["warp"].locally_optimal

@@ -165,7 +165,7 @@ def chosen(modes: ModeSet, choose: Callable[[Tensor, int], str]) -> Controller:
 
 def same_model(cfg: FlipCfg) -> bool:
     """Whether the planner's model is the nominal robot's own, so that a snapshot means the same in both."""
-    return cfg.substeps == SUBSTEPS and cfg.iterations is None
+    return cfg.substeps == SUBSTEPS and cfg.iterations is None and cfg.engine == "mujoco"
 
 
 S = TypeVar("S")

@@ -1,7 +1,7 @@
 """Search the motion that turns a robot on its back onto its feet or belly: `python tools/roll_motion.py`.
 
-The cross-entropy method over a few points of all twelve joints, from states of robots that were dropped and lie on
-their backs. What it finds belongs into cfg/showreel.toml; it prints how many other robots the motion turns.
+The cross-entropy method over a few points of all twelve joints, from states of robots that were dropped and
+lie on their backs. What it finds belongs into cfg/showreel.toml; it prints how many other robots it turns.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Args:
     robots: int = 16
     samples: int = 40
     elites: int = 6
-    iterations: int = 16
+    iterations: int = 6
     validate: int = 200
     seed: int = 0
     threads: int = 0

@@ -12,7 +12,7 @@ from hmc.ensemble import Ensemble
 from hmc.go2.model import SUBSTEPS, load_model
 from hmc.go2.variants import VariantsCfg, draw
 from hmc.sim.base import Sim
-from hmc.sim.mujoco import MujocoSim
+from hmc.sim.make import make_sim
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,10 @@ def make_ensemble(
     substeps: int = SUBSTEPS,
     iterations: int | None = None,
     threads: int = 0,
+    engine: str = "mujoco",
+    device: str = "",
 ) -> Ensemble | None:
-    """The nominal Go2 and `cfg.members` others; None where there are none."""
+    """The nominal Go2 and `cfg.members` others, engine as of `hmc.go2.task.make_sim`; None for no others."""
     if cfg.members == 0:
         return None
     generator = torch.Generator().manual_seed(seed)
@@ -69,9 +71,11 @@ def make_ensemble(
         errors.append(error)
 
     def sim(members: Sequence[int]) -> Sim:
-        return MujocoSim(
+        return make_sim(
             models[0],
             len(members),
+            engine,
+            device=device or None,
             substeps=substeps,
             threads=threads,
             latency=[late[i] for i in members],

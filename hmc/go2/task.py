@@ -21,8 +21,8 @@ from hmc.go2.value import Value
 from hmc.modes import Mode, ModeSet, Motion
 from hmc.rules import Rules
 from hmc.sampling import SamplingCfg, SamplingMpc
+from hmc.sim import make as engines
 from hmc.sim.base import Sim
-from hmc.sim.mujoco import MujocoSim
 from hmc.task import Task
 
 TARGETS = (FOOTSTAND, HANDSTAND, STAND)  # what a cost may ask for
@@ -97,6 +97,8 @@ class FlipCfg:
         substeps: physics steps a control step of the planner's model; the robot's own has 4.
         iterations: of the contact solver in the planner's model, at most; None for the robot's own.
         ensemble: other models that schedules are judged on as well.
+        engine: that the planner rolls out on: mujoco, or warp for a GPU, or auto.
+        device: of the engine; empty for its own, as in `hmc.sim.make.make_sim`.
         idle: further modes that this task has no use for, to see what they cost the search: of stand, getup
             (policies), home and crouch (joint positions held).
     """
@@ -110,6 +112,8 @@ class FlipCfg:
     substeps: int = go2.SUBSTEPS
     iterations: int | None = None
     ensemble: EnsembleCfg = field(default_factory=EnsembleCfg)
+    engine: Literal["mujoco", "warp", "auto"] = "mujoco"
+    device: str = ""
     idle: tuple[Literal["stand", "getup", "home", "crouch"], ...] = ()
 
 
@@ -245,11 +249,18 @@ def dense_guess(points: Tensor, spacing: int) -> Tensor:
 
 
 def make_sim(
-    num_worlds: int, substeps: int = go2.SUBSTEPS, iterations: int | None = None, threads: int = 0
+    num_worlds: int,
+    substeps: int = go2.SUBSTEPS,
+    iterations: int | None = None,
+    threads: int = 0,
+    engine: str = "mujoco",
+    device: str = "",
 ) -> Sim:
-    """Worlds of the Go2 on the C engine; see `hmc.go2.model.load_model`."""
+    """Worlds of the Go2; see `hmc.go2.model.load_model` and `hmc.sim.make.make_sim` (device "": none)."""
     model = go2.load_model(substeps, iterations)
-    return MujocoSim(model, num_worlds, substeps=substeps, threads=threads)
+    return engines.make_sim(
+        model, num_worlds, engine, device=device or None, substeps=substeps, threads=threads
+    )
 
 
 def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
@@ -261,6 +272,7 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
         threads: of the engine and the policies; 0 for all cores.
     """
     coarse: dict[str, Any] = {"substeps": cfg.substeps, "iterations": cfg.iterations, "threads": threads}
+    coarse |= {"engine": cfg.engine, "device": cfg.device}
     sim = partial(make_sim, **coarse)
     modes = ModeSet(
         [
