@@ -304,8 +304,7 @@ class _Rollout:
         ends = self.task.cost.terminal_terms(x, torch.full((len(x),), k, device=x.device)).to(torch.float64)
         terms = np.concatenate([self.sums, ends.cpu().numpy().T])
         costs = _total(terms)
-        places = self.at if isinstance(self.at, slice) else self.at.cpu().numpy()
-        self.terms[:, places] = terms
+        self.terms[:, self._blocks(self._indices)] = terms
         self.result[self.ids] = np.where(self._all(np.isfinite(costs)), self._risk(costs), math.inf)
 
     def _price(self, k: int, *rows: Tensor, sane: Flags | None = None) -> tuple[Tensor, ...]:
