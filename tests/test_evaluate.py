@@ -394,15 +394,3 @@ def test_a_trace_of_a_diverging_schedule_ends_there():
     assert len(whole.x) == len(whole.stage) + 1 < 7
     assert not whole.x[-1].isfinite().all()
     assert whole.x[:-1].isfinite().all()
-
-
-@pytest.mark.parametrize("part", ["actions", "memory"])
-def test_a_mode_of_the_wrong_shape_is_named(part):
-    class Wrong(Ramp):
-        name = "wrong"
-
-        def act(self, x, u, memory, k):
-            return (u[:, [0, 0]], memory) if part == "actions" else (u, memory[:, :1])
-
-    with pytest.raises(ValueError, match=rf"mode 'wrong': act\(\) {part} have shape .*expected \(1, "):
-        evaluator(toy_task(6, [Wrong()])).cost(Schedule((0,) * 6))
