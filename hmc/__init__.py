@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from hmc.cost import Cost as Cost
     from hmc.ensemble import Ensemble as Ensemble
     from hmc.evaluate import Evaluator as Evaluator
+    from hmc.modes import ConstantInput as ConstantInput
     from hmc.modes import Mode as Mode
     from hmc.modes import ModeSet as ModeSet
     from hmc.modes import Motion as Motion
@@ -36,6 +37,7 @@ _HOME = {
     "Evaluator": "hmc.evaluate",
     "Mode": "hmc.modes",
     "ModeSet": "hmc.modes",
+    "ConstantInput": "hmc.modes",
     "Motion": "hmc.modes",
     "Plan": "hmc.planner",
     "PlanInterrupted": "hmc.planner",

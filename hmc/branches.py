@@ -48,7 +48,7 @@ def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
     n, horizon = schedules.shape
     steps = _steps(schedules)
     order = _order(steps, trunk)
-    rows = steps[:, order]
+    rows = steps.take(order, 1)
     before = np.empty_like(rows)  # the one before each; the first comes after the trunk
     before[:, 1:], before[: len(trunk), 0], before[len(trunk) :, 0] = rows[:, :-1], trunk, -1
     apart = before != rows
@@ -68,7 +68,7 @@ def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
         seeds.append(int((stems < 0).sum()))
     return Branches(
         row=torch.from_numpy(order[slots]),
-        modes=torch.from_numpy(rows[:, slots]).T,
+        modes=torch.from_numpy(rows.take(slots, 1)).T,
         parent=torch.from_numpy(parent),
         born=born,
         seeds=seeds,
@@ -80,7 +80,7 @@ def added_steps(schedules: Tensor, trunk: Sequence[int]) -> tuple[np.ndarray, np
     n, horizon = schedules.shape
     steps = _steps(schedules)
     order = _order(steps, trunk)
-    rows = steps[:, order]
+    rows = steps.take(order, 1)
     # what each, in order, shares with the one before; `most` is with the trunk, which is always there
     apart = rows[:, 1:] != rows[:, :-1]
     shared = [0, *np.where(apart.any(0), apart.argmax(0), horizon).tolist(), 0]
@@ -116,15 +116,14 @@ def _order(steps: np.ndarray, trunk: Sequence[int]) -> np.ndarray:
     known[known == lead + 1] = 0
     # a word holds as many steps as fit, the first one in its highest bits
     bits = int(swapped.max(initial=1)).bit_length()
-    fit = 64 // bits
-    words = -(-horizon // fit)
-    padded = np.zeros((words * fit, n), dtype=np.uint64)
-    padded[:horizon] = swapped
-    packed = padded.reshape(words, fit, n)
-    keys = packed[:, 0]
-    for step in range(1, fit):
-        keys = keys << np.uint64(bits) | packed[:, step]
-    return np.lexsort(keys[::-1])
+    fit, words = 64 // bits, []
+    for first in range(0, horizon, fit):
+        word = np.zeros(n, dtype=np.uint64)
+        for step in swapped[first : first + fit]:
+            np.left_shift(word, np.uint64(bits), out=word)
+            np.bitwise_or(word, step.astype(np.uint64), out=word)
+        words.append(word)
+    return np.lexsort(words[::-1])
 
 
 def _steps(schedules: Tensor) -> np.ndarray:

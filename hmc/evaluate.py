@@ -16,7 +16,7 @@ from hmc.rollout import Rolled, record, roll
 from hmc.schedule import Schedule
 from hmc.sim.base import Sim
 from hmc.start import Start
-from hmc.table import Table
+from hmc.table import Rows, Table
 from hmc.task import Task
 from hmc.trace import Trace, Traces, roots
 from hmc.worlds import Worlds
@@ -61,7 +61,7 @@ class Evaluator:
         if known is not None and len(self._trunk) == 1 and known.meets(self.trunk):
             self._trunk = (known,)
         self._next: Schedule | None = None  # to be recorded with the next batch
-        self._traces: dict[bytes, Callable[[], Traces]] = {}  # of the last batch, where they were kept
+        self._traces: dict[int, Callable[[], Traces]] = {}  # of the last batch, where they were kept
         self._table = Table(len(task.modes), len(task.cost.names))
 
     @property
@@ -109,42 +109,37 @@ class Evaluator:
                 f"schedules hold modes {int(schedules.min())} to {int(schedules.max())}: task "
                 f"{self.task.name!r} has 0 to {len(self.task.modes) - 1}"
             )
-        keys = self._table.keys(schedules)
-        missing = np.flatnonzero(self._table.missing(self._table.find(keys), bound))
-        todo: dict[bytes, int] = {}
-        for row in missing.tolist():
-            todo.setdefault(keys[row], row)
-        fresh, rows = self._allowed(
-            list(todo), torch.tensor(list(todo.values()), dtype=torch.long), schedules
-        )
-        if len(fresh) > self.size:  # neighbours share most: let them be in one chunk
-            order = in_order(schedules[rows].cpu(), self._lead)
-            fresh, rows = [fresh[i] for i in order], rows[order]
+        rows = self._table.rows(schedules)
+        missing = np.flatnonzero(self._table.missing(rows, bound))
+        todo = missing[np.sort(np.unique(rows[missing], return_index=True)[1])]  # each once
+        todo = self._allowed(todo, rows, schedules)
+        if len(todo) > self.size:  # neighbours share most: let them be in one chunk
+            todo = todo[in_order(_rows(schedules, todo).cpu(), self._lead)]
         first = 0
-        while first < len(fresh):
+        while first < len(todo):
             beside = self._beside
             size = self.size - len(beside)
-            chunk = slice(first, first + size)
+            chunk = todo[first : first + size]
             modes = beside[0].modes if beside else None
-            rolled = roll(self._worlds, self._trunk, schedules[rows[chunk]], bound, stop, modes)
+            rolled = roll(self._worlds, self._trunk, _rows(schedules, chunk), bound, stop, modes)
             if rolled is None:
                 break
             if rolled.trace is not None:
                 self._trunk, self._next = rolled.trace, None
-            self._learn(fresh[chunk], rolled)
-            self._keep(fresh[chunk], rolled)
+            self._learn(rows[chunk], rolled)
+            self._keep(rows[chunk], rolled)
             first += size
-        return torch.from_numpy(self._table.costs(self._table.find(keys), bound))
+        return torch.from_numpy(self._table.costs(rows, bound))
 
     def needs(self, schedules: Tensor) -> NDArray[np.int64]:
         """Control steps, modes' own aside, that the costs of the first 1, 2, ... of schedules (N, T) take.
 
         Fewer if some are pruned or barred; none for those that break a rule.
         """
-        new = self._table.missing(self._table.find(self._table.keys(schedules)), math.inf)
+        new = self._table.missing(self._table.rows(schedules), math.inf)
         if self.task.rules is not None:
             new &= ~self._broken(schedules).cpu().numpy()
-        wanted, horizon = schedules[torch.from_numpy(new)].cpu(), self.task.horizon
+        wanted, horizon = _rows(schedules, np.flatnonzero(new)).cpu(), self.task.horizon
         ahead = [schedule.tensor()[None].to(wanted.dtype) for schedule in self._beside]
         shared, alone = added_steps(torch.cat([*ahead, wanted]), self._lead)
         # a part that does not fit into the simulator with those before it rolls one beginning out again
@@ -161,17 +156,14 @@ class Evaluator:
         A schedule of the last batch was recorded with it, if that was small. Another one whose cost is known
         is recorded together with the next batch, which costs as many control steps as alone and less time.
         """
-        rows = schedule.tensor()[None]
-        key = self._table.keys(rows)
-        found = self._table.find(key)
-        known = not bool(self._table.missing(found, math.inf)[0])
-        if known:
-            cost = float(self._table.costs(found, math.inf)[0])
-            if math.isfinite(cost) and key[0] in self._traces:
-                self._trunk = self._traces[key[0]]()
+        rows = self._table.rows(schedule.tensor()[None])
+        if not self._table.missing(rows, math.inf)[0]:
+            cost = float(self._table.costs(rows, math.inf)[0])
+            if math.isfinite(cost) and int(rows[0]) in self._traces:
+                self._trunk = self._traces[int(rows[0])]()
             self._next = schedule if math.isfinite(cost) and schedule.modes != self.trunk.modes else None
             return cost
-        if found[0] < 0 and not self._allowed(key, torch.tensor([0]), rows)[0]:
+        if len(self._allowed(np.array([0]), rows, schedule.tensor()[None])) == 0:
             return math.inf
         self._next = schedule
         self.record()
@@ -184,7 +176,7 @@ class Evaluator:
         self.rollouts += 1
         self.ruled_out += barred
         self.diverged += not (math.isfinite(cost) or barred)
-        self._table.learn(key, np.array([cost]), np.array([False]), terms.cpu().numpy()[None])
+        self._table.learn(rows, np.array([cost]), np.array([False]), terms.cpu().numpy()[None])
         return cost
 
     @torch.no_grad()
@@ -201,7 +193,7 @@ class Evaluator:
         """Cost of one schedule, term by term; NaN where its world diverged."""
         rows = schedule.tensor()[None]
         self.costs(rows)
-        terms = self._table.terms(int(self._table.find(self._table.keys(rows))[0]))
+        terms = self._table.terms(int(self._table.rows(rows)[0]))
         return dict(zip(self.task.cost.names, terms.tolist(), strict=True))
 
     def trace(self, schedule: Schedule) -> Trace:
@@ -223,27 +215,34 @@ class Evaluator:
         assert self.task.rules is not None
         return self.task.rules.broken(self.task.modes, schedules, self.start.mode, self.start.ran)
 
-    def _allowed(self, keys: list[bytes], rows: Tensor, schedules: Tensor) -> tuple[list[bytes], Tensor]:
-        """The keys and rows of schedules that break no rule; what breaks one is known to cost inf."""
+    def _allowed(self, at: Rows, rows: Rows, schedules: Tensor) -> Rows:
+        """Those of the schedules `at` (n,) that break no rule; what breaks one is known to cost inf."""
         rules = self.task.rules
-        if rules is None or not keys:
-            return keys, rows
-        broken = self._broken(schedules[rows])
-        out = [keys[i] for i in broken.nonzero().squeeze(1).tolist()]
+        if rules is None or len(at) == 0:
+            return at
+        broken = self._broken(_rows(schedules, at)).cpu().numpy()
+        out = rows[at[broken]]
         nothing = np.full((len(out), len(self.task.cost.names)), math.nan)
         self._table.learn(out, np.full(len(out), math.inf), np.zeros(len(out), dtype=bool), nothing)
-        self.ruled_out += int(broken.sum())
-        return [key for key, bad in zip(keys, broken.tolist(), strict=True) if not bad], rows[~broken]
+        self.ruled_out += len(out)
+        return at[~broken]
 
-    def _keep(self, keys: list[bytes], rolled: Rolled) -> None:
+    def _keep(self, rows: Rows, rolled: Rolled) -> None:
         """How to come by the traces of schedules just rolled out."""
         traces = rolled.traces
-        self._traces = {} if traces is None else {key: partial(traces, i) for i, key in enumerate(keys)}
+        self._traces = (
+            {} if traces is None else {row: partial(traces, i) for i, row in enumerate(rows.tolist())}
+        )
 
-    def _learn(self, keys: list[bytes], rolled: Rolled) -> None:
-        self.rollouts += len(keys)
+    def _learn(self, rows: Rows, rolled: Rolled) -> None:
+        self.rollouts += len(rows)
         self.diverged += int(rolled.diverged.sum())
         self.pruned += int(rolled.pruned.sum())
         self.ruled_out += int(rolled.barred.sum())
         cost, pruned, terms = (part.cpu().numpy() for part in (rolled.cost, rolled.pruned, rolled.terms))
-        self._table.learn(keys, cost, pruned, terms)
+        self._table.learn(rows, cost, pruned, terms)
+
+
+def _rows(schedules: Tensor, at: Rows) -> Tensor:
+    """Rows of schedules (N, T), laid out as `SwitchSpace.stitch` and the rollout have them: by steps."""
+    return schedules.T.index_select(1, torch.from_numpy(at).to(schedules.device)).T

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import math
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -49,6 +51,21 @@ class Mode(ABC):
         """
 
 
+class ConstantInput(Mode):
+    """The same input at every step, whatever the state.
+
+    Args:
+        name: of the mode.
+        value: of each number of the input.
+    """
+
+    def __init__(self, name: str, value: float):
+        self.name, self.value = name, value
+
+    def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.full_like(u, self.value), memory
+
+
 class Motion(Mode):
     """Plays inputs, one a control step since entry, and then holds the last one.
 
@@ -74,7 +91,14 @@ class Motion(Mode):
 
 
 class ModeSet:
-    """An ordered set of modes; a schedule refers to them by index."""
+    """An ordered set of modes; a schedule refers to them by index.
+
+    Attributes:
+        names: of the modes.
+        memory_size: of the mode that remembers most.
+        constants: where all modes are constant inputs, their values, (M,): who acts where need not be looked
+            up then, world by world; None otherwise.
+    """
 
     def __init__(self, modes: Sequence[Mode]):
         if not modes:
@@ -86,6 +110,8 @@ class ModeSet:
         self._modes = tuple(modes)
         self.names = tuple(names)
         self.memory_size = max(mode.memory_size for mode in modes)
+        values = [mode.value for mode in modes if type(mode) is ConstantInput and math.isfinite(mode.value)]
+        self.constants = np.array(values) if len(values) == len(modes) else None
 
     def __len__(self) -> int:
         return len(self._modes)

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hmc.branches import Branches, branches
-from hmc.cost import total
-from hmc.sim.ids import Ids, blocks, count
-from hmc.trace import Recorder, Traces
-from hmc.worlds import Crew, Worlds, finite
+from hmc.sim.ids import Ids, blocks
+from hmc.trace import Floats, Recorder, Traces
+from hmc.worlds import Crew, Flags, Indices, Worlds, finite
 
-ROWS, STEPS = 256, 8
+ROWS, STEPS = 256, 8  # of states that are priced in one call, at most
+CHEAP_ROWS = 8192  # where a control step takes less time than such a call
 RECORDED = 64  # branches that are all recorded, at most
 
 
@@ -71,7 +73,7 @@ def roll(
     """
     rows = schedules.cpu()
     if recorded is not None:
-        rows = torch.cat([torch.tensor([recorded], dtype=rows.dtype), rows])
+        rows = torch.cat([torch.tensor(recorded, dtype=rows.dtype)[:, None], rows.T], 1).T
     tree = branches(rows, trunk[0].modes[: len(trunk[0])])
     rollout = _Rollout(worlds, trunk, tree, bound, recorded is not None)
     first = next((i for i, born in enumerate(tree.born[1:]) if born > 0), rows.shape[1])
@@ -101,94 +103,101 @@ def record(worlds: Worlds, known: Traces, schedule: Sequence[int]) -> Traces:
 class _Rollout:
     """A tree of n branches being rolled out on E members; arguments as of `roll`.
 
-    `ids` are the branches that go on, `at` the worlds that these are in. What steps cost is found out for
-    several of them at a time: a call for few worlds takes as long as one for many. `watched` says whether
-    row 0 is to be recorded whatever the bound.
+    `ids` are the branches that go on, ascending, `at` the worlds that these are in. What steps cost is found
+    out for several of them at a time: a call for few worlds takes as long as one for many. `watched` says
+    whether row 0 is to be recorded whatever the bound. All that is known of branches is in numpy, whose calls
+    take a fraction of the time of torch's.
     """
 
     def __init__(self, worlds: Worlds, trunk: Traces, tree: Branches, bound: float, watched: bool):
-        task, device, n = worlds.task, worlds.sim.device, len(tree.row)
+        task, n = worlds.task, len(tree.row)
         self.worlds, self.sim, self.task, self.trunk, self.tree = worlds, worlds.sim, task, trunk, tree
         self.members, self.first, self.ensemble = len(trunk), trunk[0].k, task.ensemble
-        self.modes, self.parents = tree.modes.to(device), tree.parent.to(device)
-        self.horizon, self.stages = tree.modes.shape[1], len(task.cost.stage)
+        self.modes, self.parents = tree.modes.numpy().T, tree.parent.numpy()
+        self.horizon, self.stages = len(self.modes), len(task.cost.stage)
         self.limit = bound if task.cost.nonnegative else math.inf
         self.slack = 1e-9 * abs(self.limit)  # more than rounding can make of partial cost and lower bound
-        self.limits = torch.full((n,), self.limit, dtype=torch.float64, device=device)
         self.path = tree.path(0) if watched else []
-        self.limits[[branch for branch in set(self.path) if branch >= 0]] = math.inf
+        self.kept = np.array(sorted({branch for branch in self.path if branch >= 0}), dtype=np.int64)
         self.recorder = (
             Recorder(trunk, None if n <= RECORDED else self.path) if watched or n <= RECORDED else None
         )
-        self.terms = torch.zeros(len(task.cost.names), n * self.members, dtype=torch.float64, device=device)
-        self.result = torch.full((n,), math.inf, dtype=torch.float64, device=device)
-        self.going, self.pruned, self.barred = torch.zeros(3, n, dtype=torch.bool, device=device)
+        self.terms = np.full((len(task.cost.names), n * self.members), math.nan)  # of those that arrived
+        self.result = np.full(n, math.inf)
+        self.pruned, self.barred = np.zeros((2, n), dtype=bool)
+        self._sums = np.empty((self.stages, n * self.members))
+        self.cheap = bool(getattr(worlds.sim, "cheap", False))
         self._go_on(slice(0, 0))  # a slice while none has ended
         self.crew: Crew | None = None  # who acts in them; None: to be found out
-        self.changes = [True, *(tree.modes[:, 1:] != tree.modes[:, :-1]).any(0).tolist()]
-        self.unpriced: list[tuple[Tensor, Tensor, Tensor]] = []  # x, u, u before of the last steps
+        self.changes = [True, *(self.modes[1:] != self.modes[:-1]).any(1).tolist()]
+        # of the last steps who made them, x, u and u before; and after how many of these worlds were born
+        self.unpriced: list[tuple[np.ndarray | slice, Tensor, Tensor, Tensor]] = []
+        self.births: list[tuple[int, slice, Indices]] = []
         # what cannot end a branch on the way is looked at now and then only
         watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
         self.at_once = 1 if watchful else STEPS
+        self.constant = task.modes.constants is not None
+        self.rows = CHEAP_ROWS if self.cheap else ROWS
 
     def advance(self, i: int) -> None:
         """Step i of all branches that go on: what is born then, and their end at i = T, included."""
-        task, sim, k = self.task, self.sim, self.first + i
-        if i == self.horizon or self.tree.born[i + 1] > self.tree.born[i]:
-            self._price(k)
+        sim, k, born = self.sim, self.first + i, self.tree.born
+        if i == self.horizon or born[i + 1] > born[i]:
+            if i == self.horizon or not self.cheap:  # what is beyond its limit has no children
+                self._price(k)
             self._grow(i)
-        if count(self.at, sim.num_worlds) == 0:
+        if self.size == 0:
             return
         x, u_prev = sim.x(self._at), sim.u(self._at)
         if self.recorder is not None:
-            self.recorder.arrive(self.worlds, i, self.at, x, u_prev)
+            self.recorder.arrive(self.worlds, i, self.ids, self.at, x, u_prev)
         if not math.isfinite(float(x.sum())):  # a finite sum has finite parts
             x, u_prev = self._price(k, x, u_prev)
-            x, u_prev = self._drop(~self._all(finite(x)), x, u_prev)
-        if len(x) > 0 and i == self.horizon:
-            terminal = task.cost.terminal_terms(x, torch.full((len(x),), k, device=sim.device))
-            self.terms[self.stages :, self.at] = terminal.to(torch.float64).T
-            costs = total(self.terms[:, self.at].T)
-            self.result[self.ids] = self._risk(costs).where(self._all(costs.isfinite()), math.inf)
+            x, u_prev = self._drop(~self._all(_flags(finite(x))), x, u_prev)
+        if i == self.horizon:
+            self._arrive(x, k)
             return
-        if len(x) > 0:
+        if self.size > 0 and self.at_once == 1:
             x, u_prev = self._give_up(i, x, u_prev)
-        if len(x) == 0:
+        if self.size == 0:
             return
         if self.crew is None or self.changes[i]:
-            self.crew = self.worlds.crew(self.at, self._each(self.modes[self.ids, i]).long())
+            modes = self._each(self.modes[i, self.ids])
+            self.crew = self.worlds.crew(self.at, modes, modes if self.constant else self._before(i))
         u = self.worlds.act(self.crew, x, u_prev, k)
-        self.unpriced.append((x, u, u_prev))
-        sane = None if math.isfinite(float(u.sum())) else self._all(finite(u))
-        if sane is not None or len(self.unpriced) >= min(self.at_once, ROWS // len(u)):
-            (u,) = self._price(k + 1, u, sane=sane)
-        if len(u) > 0:
+        self.unpriced.append((self.ids, x, u, u_prev))
+        fine = self.crew.held is not None or math.isfinite(float(u.sum()))
+        if not fine or len(self.unpriced) >= min(self.at_once, self.rows // self.size // self.members):
+            (u,) = self._price(k + 1, u, sane=None if fine else self._all(_flags(finite(u))))
+        if self.size > 0:
             sim.step(u, self._at)
-            self.worlds.own_steps += len(u)
+            self.worlds.own_steps += self.size * self.members
 
     def rolled(self, first: int) -> Rolled:
         """What came of the schedules from row `first` on; of row 0 the traces, if it was watched."""
-        ended = ~self.result.isfinite()
+        ended = ~np.isfinite(self.result)
         diverged = ended & ~self.pruned & ~self.barred
-        recorder, tree, going, barred = self.recorder, self.tree, self.going.tolist(), self.barred.tolist()
-        terms = self.terms.T.reshape(-1, self.members, len(self.terms))
+        recorder, tree, barred = self.recorder, self.tree, self.barred.tolist()
+        terms = torch.from_numpy(self.terms).T.reshape(-1, self.members, len(self.terms))
 
         def traces(row: int) -> Traces:
             assert recorder is not None
             path = tree.path(row)
             last = path[-1]
             modes = tuple(tree.modes[last].tolist())
-            terminal = terms[last, :, self.stages :] if going[last] else None
-            return recorder.traces(modes, path, terminal, barred[last])
+            return recorder.traces(modes, path, terms[last, :, self.stages :], barred[last])
 
-        at = tree.row.argsort()[first:].to(self.sim.device)
-        known = terms[at].masked_fill((ended | self.pruned)[at, None, None], math.nan)
+        at = tree.row.argsort()[first:]
+        known = terms[at].masked_fill(torch.from_numpy(ended | self.pruned)[at, None, None], math.nan)
+        result, given_up, out = (
+            torch.from_numpy(each)[at] for each in (self.result, self.pruned, self.barred)
+        )
         return Rolled(
-            self.result[at],
+            result,
             known[:, 0] if self.ensemble is None else self.ensemble.terms(known),
-            diverged[at],
-            self.pruned[at],
-            self.barred[at],
+            torch.from_numpy(diverged)[at],
+            given_up,
+            out,
             traces(0) if self.path else None,
             None if recorder is None or recorder.path is not None else lambda row: traces(first + row),
         )
@@ -196,68 +205,133 @@ class _Rollout:
     @property
     def _at(self) -> Ids:
         """The worlds of `at`; None, which costs least, where they are all."""
-        return None if count(self.at, self.sim.num_worlds) == self.sim.num_worlds else self.at
+        return None if self.size * self.members == self.sim.num_worlds else self.at
 
-    def _go_on(self, ids: Tensor | slice) -> None:
+    @property
+    def _indices(self) -> np.ndarray:
+        return np.arange(self.ids.stop) if isinstance(self.ids, slice) else self.ids
+
+    @property
+    def sums(self) -> Floats:
+        """Stage terms of the worlds of `at` so far, (number of stage terms, len(at))."""
+        return self._sums[:, : self.size * self.members]
+
+    def _device(self, indices: np.ndarray) -> Tensor:
+        return torch.from_numpy(indices).to(self.sim.device)
+
+    def _go_on(self, ids: np.ndarray | slice) -> None:
         """Only branches `ids` go on."""
-        self.ids, self.at = ids, blocks(ids, self.members)
+        self.ids, self.crew = ids, None
+        self.size = ids.stop if isinstance(ids, slice) else len(ids)
+        places = slice(0, self.size) if self.cheap or isinstance(ids, slice) else self._device(ids)
+        self.at = blocks(places, self.members)
 
-    def _each(self, rows: Tensor) -> Tensor:
-        """Of rows (n, ...), one a branch, one a world, (n E, ...)."""
-        return rows if self.members == 1 else rows.repeat_interleave(self.members, 0)
+    def _blocks(self, branches: Indices) -> Indices:
+        """The worlds of branches (n,) that lie side by side, (n E,)."""
+        if self.members == 1:
+            return branches
+        worlds: Indices = (branches[:, None] * self.members + np.arange(self.members)).ravel()
+        return worlds
 
-    def _all(self, flags: Tensor) -> Tensor:
+    def _each(self, rows: np.ndarray) -> np.ndarray:
+        """Of rows (n,), one a branch, one a world, (n E,)."""
+        return rows if self.members == 1 else rows.repeat(self.members)
+
+    def _all(self, flags: Flags) -> Flags:
         """Of which branches all worlds are flagged, of flags (n E,) one a world, (n,) bool."""
-        return flags if self.members == 1 else flags.view(-1, self.members).all(1)
+        return flags if self.members == 1 else np.all(flags.reshape(-1, self.members), axis=1)
 
-    def _risk(self, costs: Tensor) -> Tensor:
+    def _risk(self, costs: Floats) -> Floats:
         """What branches cost when their worlds cost (n E,), (n,)."""
-        return costs if self.ensemble is None else self.ensemble.risk(costs.view(-1, self.members))
+        if self.ensemble is None:
+            return costs
+        risk: Floats = self.ensemble.risk(torch.from_numpy(costs).view(-1, self.members)).numpy()
+        return risk
+
+    def _before(self, i: int) -> np.ndarray:
+        """The modes that ran before step i, one a world."""
+        if i > 0:
+            return self._each(self.modes[i - 1, self.ids])
+        return np.full(self.size * self.members, int(self.trunk[0].mode[0]))
 
     def _grow(self, i: int) -> None:
         """Branches that are born at step i become copies of what they part from."""
-        old, now, size = self.tree.born[i], self.tree.born[i + 1], self.members
+        old, now, members = self.tree.born[i], self.tree.born[i + 1], self.members
         if now == old:
             return
         seeds = old + self.tree.seeds[i]
-        stems, shoots = self.parents[seeds:now], slice(seeds, now)
+        width, grown = self.size * members, (self.size + seeds - old) * members
         for member, trunk in enumerate(self.trunk if seeds > old else ()):
-            at = slice(old * size + member, seeds * size, size)
-            self.worlds.reset(trunk.start(i), at)
-            self.terms[: self.stages, at] = trunk.sums[i][:, None]
-        if now > seeds:
-            parents, children = blocks(stems, size), blocks(shoots, size)
-            self.worlds.branch(parents, children)
-            self.terms[:, children] = self.terms[:, parents]
-        self.going[old:now], self.crew = True, None
-        if isinstance(self.ids, slice):
-            self._go_on(slice(0, now))
-            return
-        for each in (self.result, self.pruned, self.barred, self.going):  # a stem that has ended passes it on
-            each[shoots] = each[stems]
-        self._go_on(self.going[:now].nonzero().squeeze(1))
+            begin = width if self.cheap else old * members
+            self.worlds.enter(trunk, i, slice(begin + member, begin + grown - width, members))
+            self._sums[:, width + member : grown : members] = trunk.sums[i].numpy()[:, None]
+        stems, born = self.parents[seeds:now], np.arange(old, now)
+        ids: Indices | slice = slice(0, now)
+        places = stems
+        if not isinstance(self.ids, slice):
+            places = self.ids.searchsorted(stems)
+            there = self.ids.take(places, mode="clip") == stems if self.size > 0 else stems < 0
+            if not there.all():  # a stem that has ended passes on how
+                gone, ends = born[seeds - old :][~there], stems[~there]
+                for each in (self.result, self.pruned, self.barred):
+                    each[gone] = each[ends]
+                born, stems, places = np.delete(born, gone - old), stems[there], places[there]
+            ids = np.concatenate([self.ids, born])
+        self._go_on(ids)
+        if len(stems) > 0:
+            children = slice(grown // members, grown // members + len(stems))
+            self.births.append(
+                (len(self.unpriced), slice(grown, grown + len(stems) * members), self._blocks(places))
+            )
+            if not self.unpriced:
+                self._inherit()
+            there = self.cheap or isinstance(ids, slice)
+            self.worlds.branch(
+                self._device(self._blocks(places if self.cheap else stems)),
+                blocks(children if there else self._device(born[seeds - old :]), members),
+            )
 
-    def _price(self, k: int, *rows: Tensor, sane: Tensor | None = None) -> tuple[Tensor, ...]:
+    def _inherit(self) -> None:
+        """Give worlds the sums of those that they were born from, where these are known by now."""
+        while self.births and self.births[0][0] == 0:
+            _, children, parents = self.births.pop(0)
+            self._sums[:, children] = self._sums.take(parents, 1)
+
+    def _arrive(self, x: Tensor, k: int) -> None:
+        """The end at control step k, of worlds in states x: what they cost."""
+        if self.size == 0:
+            return
+        ends = self.task.cost.terminal_terms(x, torch.full((len(x),), k, device=x.device)).to(torch.float64)
+        terms = np.concatenate([self.sums, ends.cpu().numpy().T])
+        costs = _total(terms)
+        self.terms[:, self._blocks(self._indices)] = terms
+        self.result[self.ids] = np.where(self._all(np.isfinite(costs)), self._risk(costs), math.inf)
+
+    def _price(self, k: int, *rows: Tensor, sane: Flags | None = None) -> tuple[Tensor, ...]:
         """Add what the last steps cost, the last one that before control step k, and end the branches that
         are beyond their limit, no number, or not `sane` (n,); the `rows`, (n E, ...) each, of the others."""
         if not self.unpriced:
             return rows
-        steps, n = len(self.unpriced), len(self.unpriced[0][0])
-        x, u, u_prev = self.unpriced[0] if steps == 1 else map(torch.cat, zip(*self.unpriced, strict=True))
-        self.unpriced = []
-        ks = torch.arange(k - steps, k, device=x.device).repeat_interleave(n)
-        terms = self.task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64) * self.sim.dt
-        stage = terms.T.reshape(self.stages, steps, n)
-        sums = self.terms[: self.stages, self.at]
-        for i, step in enumerate(stage.unbind(1), k - steps - self.first):
-            sums = sums + step
+        steps, self.unpriced = self.unpriced, []
+        widths, first = [x.shape[0] for _, x, _, _ in steps], k - len(steps)
+        x, u, u_prev = (
+            steps[0][1:] if len(steps) == 1 else map(torch.cat, zip(*[s[1:] for s in steps], strict=True))
+        )
+        ks = torch.from_numpy(np.arange(first, k).repeat(widths)).to(x.device)
+        terms = self.task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64).cpu().numpy() * self.sim.dt
+        for (ids, *_), stage in zip(steps, np.split(terms.T, np.cumsum(widths[:-1]), 1), strict=True):
+            sums = self._sums[:, : stage.shape[1]]
+            np.add(sums, stage, out=sums)
             if self.recorder is not None:
-                self.recorder.step(i, self.at, step)
-        self.terms[: self.stages, self.at] = sums
-        costs = total(self.terms[:, self.at].T)
+                self.recorder.step(first - self.first, ids, stage)
+            first += 1
+            self.births = [(after - 1, born, of) for after, born, of in self.births]
+            self._inherit()
+        sums = self.sums
+        costs = _total(sums)
         partial = self._risk(costs)
-        if sane is not None or not math.isfinite(float(costs.sum())) or self._beyond(partial).any():
-            fine = self._all(costs.isfinite())
+        if sane is not None or not math.isfinite(costs.sum()) or partial.max() > self.limit:
+            fine = self._all(np.isfinite(costs))
             return self._prune(partial, fine if sane is None else fine & sane, *rows)
         return rows
 
@@ -265,41 +339,48 @@ class _Rollout:
         """End what a guard bars and what is sure to exceed its limit; states and inputs of the others."""
         rules, rest, k = self.task.rules, self.task.lower_bound, self.first + i
         if rules is not None and rules.guards:
-            modes = self._each(self.modes[self.ids, i]).long()
-            bad = ~self._all(~self.worlds.barred(self.at, modes, x, k))
-            if bool(bad.any()):
+            bad = self.worlds.barred(self._each(self.modes[i, self.ids]), self._before(i), x, k)
+            bad = ~self._all(~bad)
+            if bad.any():
                 self.barred[self._indices[bad]] = True
                 x, u = self._drop(bad, x, u)
         if rest is not None and self.limit < math.inf and len(x) > 0:
             steps = torch.full((len(x),), k, device=x.device)
-            least = total(self.terms[:, self.at].T) - self.slack
-            least += rest(x, steps, self.horizon - i).to(torch.float64)
+            least = _total(self.sums) - self.slack
+            least += rest(x, steps, self.horizon - i).to(torch.float64).cpu().numpy()
             # hopeless is pruned as well, and a bound that is no number bounds nothing
-            risk = self._risk(least.nan_to_num(nan=0.0))
-            if self._beyond(risk).any():
-                x, u = self._prune(risk, torch.ones_like(risk, dtype=torch.bool), x, u)
+            risk = self._risk(np.nan_to_num(least, nan=0.0, posinf=math.inf, neginf=-math.inf))
+            if risk.max() > self.limit:
+                x, u = self._prune(risk, np.ones(len(risk), dtype=bool), x, u)
         return x, u
 
-    def _beyond(self, cost: Tensor) -> Tensor:
-        """Which branches' cost so far is too much already, (n,) bool."""
-        return cost > self.limits[self.ids]
-
-    def _prune(self, cost: Tensor, sane: Tensor, *rows: Tensor) -> tuple[Tensor, ...]:
-        """End branches whose cost so far is beyond their limit, and those not `sane` (n,); as `_drop`."""
-        beyond = self._beyond(cost)
+    def _prune(self, cost: Floats, sane: Flags, *rows: Tensor) -> tuple[Tensor, ...]:
+        """End branches whose cost so far is beyond the limit, and those not `sane` (n,); as `_drop`."""
+        beyond = cost > self.limit
+        if len(self.kept) > 0 and beyond.any():
+            beyond &= ~np.isin(self._indices, self.kept)
         given_up = self._indices[sane & beyond]
         self.result[given_up], self.pruned[given_up] = cost[sane & beyond], True
         return self._drop(~sane | beyond, *rows)
 
-    @property
-    def _indices(self) -> Tensor:
-        return torch.arange(len(self.going), device=self.going.device)[self.ids]
-
-    def _drop(self, bad: Tensor, *rows: Tensor) -> tuple[Tensor, ...]:
+    def _drop(self, bad: Flags, *rows: Tensor) -> tuple[Tensor, ...]:
         """End those branches that are `bad` (n,); of `rows`, (n E, ...) each, those of the others."""
-        if bool(bad.any()):
-            index, good = self._indices, self._each(~bad)
-            self.going[index[bad]], self.crew = False, None
-            self._go_on(index[~bad])
-            rows = tuple(each[good] for each in rows)
+        if bad.any():
+            good = np.flatnonzero(self._each(~bad))
+            self._sums[:, : len(good)] = self._sums.take(good, 1)
+            self._go_on(self._indices[~bad])
+            chosen = self._device(good)
+            if self.cheap:  # to close up takes less time than to pick them out at every step
+                self.worlds.branch(chosen, self.at)
+            rows = tuple(each.index_select(0, chosen) for each in rows)
         return rows
+
+
+def _flags(values: Tensor) -> Flags:
+    flags: Flags = values.cpu().numpy()
+    return flags
+
+
+def _total(terms: Floats) -> Floats:
+    """`hmc.cost.total` of terms (number of terms, n), (n,): to the bit, which numpy's own sum is not."""
+    return reduce(np.add, terms, np.zeros(terms.shape[1]))

@@ -164,11 +164,15 @@ class SwitchSpace:
 
     def stitch(self, schedule: Schedule, indices: Tensor) -> Tensor:
         """`schedule` with each of the switches `indices` (N,) in turn, (N, T), in a type that fits."""
-        small = torch.int16 if max(self.num_modes, self.horizon) < 2**15 else torch.long
-        mode, start, duration = (part.to(small) for part in self.split(indices))
-        k = torch.arange(self.horizon, dtype=small)[:, None]
-        inside = (start <= k) & (k < start + duration)
-        return torch.where(inside, mode, schedule.tensor()[:, None].to(small)).T
+        kind = next(
+            k for k in (np.uint8, np.int16, np.int64) if max(self.num_modes, self.horizon) <= np.iinfo(k).max
+        )
+        mode, start, duration = (part.numpy() for part in self.split(indices.cpu()))
+        # unsigned, what lies before the start is far behind the end
+        wide = np.dtype(f"u{np.dtype(kind).itemsize}")
+        since = np.arange(self.horizon, dtype=wide)[:, None] - start.astype(wide)
+        base = np.array(schedule.modes, dtype=kind)[:, None]
+        return torch.from_numpy(np.where(since < duration.astype(wide), mode.astype(kind), base)).T
 
 
 class Draws:

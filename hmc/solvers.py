@@ -89,9 +89,10 @@ class Search:
             waiting = torch.cat([waiting, order.take(size - len(waiting))])
             room, limit = self.meter.room(len(waiting))
             pairs = self._pairs(room) if beside else []
-            schedules = [self.space.stitch(self.schedule, waiting[:room])]
-            schedules += [self._stitched(switches).tensor()[None] for switches in pairs]
-            batch = torch.cat(schedules)
+            batch = self.space.stitch(self.schedule, waiting[:room])
+            if pairs:
+                others = np.array([self._stitched(switches).modes for switches in pairs])
+                batch = torch.cat([batch, torch.from_numpy(others).to(batch.dtype)])
             affordable = self.meter.affordable(batch)
             if 0 <= affordable < room:
                 # few rollouts take as long as many: what is left over is not worth another round

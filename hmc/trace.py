@@ -10,15 +10,17 @@ from typing import Any, Self, TypeAlias
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.cost import total
 from hmc.schedule import Schedule
-from hmc.sim.ids import Ids, blocks, fresh
+from hmc.sim.ids import blocks, fresh
 from hmc.start import Start
 from hmc.task import Task
 from hmc.worlds import Worlds
 
+Floats = NDArray[np.float64]
 # What a situation is, a row a step: a world put there goes on bit for bit.
 SITUATION = ("x", "u", "memory", "mode", "snapshots")
 
@@ -36,8 +38,8 @@ class Trace:
         memory: memory of the mode that ran last on arrival at each step, (n + 1, memory_size).
         mode: that mode, (n + 1,) long; -1 in row 0 if none was running.
         snapshots: engine snapshot rows, (n + 1, ns).
-        stage: stage terms of each step times dt, (n, number of stage terms).
-        terminal: terminal terms, (number of terminal terms,); NaN where the world diverged.
+        stage: stage terms of each step times dt, (n, number of stage terms), on the CPU.
+        terminal: terminal terms, (number of terminal terms,), on the CPU; NaN where the world diverged.
         ran: control steps that the mode of row 0 had been running; None: unknown.
         barred: whether it ended because a guard barred the next step's mode.
     """
@@ -67,8 +69,8 @@ class Trace:
     @cached_property
     def sums(self) -> Tensor:
         """Stage terms summed up to each step, in a rollout's order, (n + 1, number of stage terms)."""
-        rows = np.vstack([np.zeros((1, self.stage.shape[1])), self.stage.cpu().numpy()])
-        return torch.from_numpy(np.add.accumulate(rows)).to(self.stage.device)
+        rows = np.vstack([np.zeros((1, self.stage.shape[1])), self.stage.numpy()])
+        return torch.from_numpy(np.add.accumulate(rows))
 
     @cached_property
     def terms(self) -> Tensor:
@@ -143,8 +145,10 @@ def _root(worlds: Worlds, start: Start, at: slice) -> Trace:
     """The trace of no steps at all from `start`, made in world `at`."""
     worlds.reset(start, at)
     stages, names = len(worlds.task.cost.stage), len(worlds.task.cost.names)
-    none = torch.full((names,), math.nan, dtype=torch.float64, device=worlds.sim.device)
-    situation: dict[str, Any] = dict(zip(SITUATION, _situation(worlds, at), strict=True))
+    none = torch.full((names,), math.nan, dtype=torch.float64)
+    running = torch.tensor([-1 if start.mode is None else start.mode])
+    rows = worlds.sim.x(at), worlds.sim.u(at), fresh(worlds.memory, at), running, worlds.sim.save(at)
+    situation: dict[str, Any] = dict(zip(SITUATION, rows, strict=True))
     return Trace(
         worlds.task,
         (),
@@ -168,37 +172,38 @@ class Recorder:
 
     def __init__(self, known: Traces, path: list[int] | None):
         self.known, self.path = known, path
-        # by step: which worlds, and what of them
-        self._rows: dict[int, tuple[Tensor | slice, tuple[Tensor, ...]]] = {}
-        self._stage: dict[int, tuple[Tensor | slice, Tensor]] = {}
+        # by step: which branches, and what of their worlds
+        self._rows: dict[int, tuple[np.ndarray | slice, tuple[Tensor, ...]]] = {}
+        self._stage: dict[int, tuple[np.ndarray | slice, Floats]] = {}
 
-    def arrive(self, worlds: Worlds, i: int, ids: Tensor | slice, x: Tensor, u: Tensor) -> None:
-        """Worlds `ids` have come to step i, in states x with last inputs u, (n, ...)."""
+    def arrive(
+        self, worlds: Worlds, i: int, ids: np.ndarray | slice, at: Tensor | slice, x: Tensor, u: Tensor
+    ) -> None:
+        """Branches `ids`, in worlds `at`, have come to step i, in states x with last inputs u, (n E, ...)."""
         if self.path is not None:
-            place = self._place(ids, self.path[i])
+            place, branch = self._place(ids, self.path[i]), self.path[i]
             if place is None:
                 return
-            ids, x, u = self._block(self.path[i]), x[place], u[place]
-        self._rows[i] = ids, (x, u, *_rest(worlds, ids))
+            ids, x, u = slice(branch, branch + 1), x[place], u[place]
+            at = blocks(ids, len(self.known)) if isinstance(at, Tensor) else place
+        self._rows[i] = ids, (x, u, fresh(worlds.memory, at), worlds.sim.save(at))
 
-    def step(self, i: int, ids: Tensor | slice, stage: Tensor) -> None:
-        """Stage terms of worlds `ids` in step i, (number of stage terms, n)."""
+    def step(self, i: int, ids: np.ndarray | slice, stage: Floats) -> None:
+        """Stage terms of branches `ids` in step i, (number of stage terms, n E)."""
         if self.path is not None:
-            place = self._place(ids, self.path[i])
+            place, branch = self._place(ids, self.path[i]), self.path[i]
             if place is None:
                 return
-            ids, stage = self._block(self.path[i]), stage[:, place]
+            ids, stage = slice(branch, branch + 1), stage[:, place].copy()
         self._stage[i] = ids, stage
 
-    def traces(
-        self, modes: tuple[int, ...], path: list[int], terminal: Tensor | None, barred: bool
-    ) -> Traces:
+    def traces(self, modes: tuple[int, ...], path: list[int], terminal: Tensor, barred: bool) -> Traces:
         """The traces of a schedule; none goes on where another one ended.
 
         Args:
             modes: of the schedule, T.
             path: the branch that it was at each step i = 0 ... T; -1 as long as it agrees with `known`.
-            terminal: its terminal terms, (E, number of terminal terms); None where it did not come so far.
+            terminal: its terminal terms, (E, number of terminal terms); NaN where it did not come so far.
             barred: whether a guard barred its next mode.
         """
         known, agree = self.known, next(i for i, branch in enumerate(path) if branch >= 0)
@@ -208,19 +213,21 @@ class Recorder:
                 break
             (ids, found), (then, situation) = self._stage[i], self._rows[i + 1]
             place, after = self._place(ids, path[i]), self._place(then, path[i + 1])
-            if place is None or after is None or not math.isfinite(float(found[:, place].sum())):
+            if place is None or after is None or not math.isfinite(found[:, place].sum()):
                 break
-            stage.append(found[:, place])
+            stage.append(found[:, place].T)
             rows.append([part[after] for part in situation])
         # steps first, then members
         stages = torch.stack([each.stage[:agree] for each in known], 1)
+        measured = [name for name in SITUATION if name != "mode"]
         parts = {
-            name: torch.stack([getattr(each, name)[: agree + 1] for each in known], 1) for name in SITUATION
+            name: torch.stack([getattr(each, name)[: agree + 1] for each in known], 1) for name in measured
         }
         if rows:
-            stages = torch.cat([stages, torch.stack(stage).mT])
-            for name, column in zip(SITUATION, zip(*rows, strict=True), strict=True):
+            stages = torch.cat([stages, torch.from_numpy(np.stack(stage))])
+            for name, column in zip(measured, zip(*rows, strict=True), strict=True):
                 parts[name] = torch.cat([parts[name], torch.stack(column)])
+        mode = torch.tensor([int(known[0].mode[0]), *modes[: len(stages)]])
 
         def trace(e: int) -> Trace:
             situation: dict[str, Any] = {name: part[:, e] for name, part in parts.items()}
@@ -228,8 +235,9 @@ class Recorder:
                 known[e].task,
                 modes,
                 known[e].k,
+                mode=mode,
                 stage=stages[:, e],
-                terminal=torch.full_like(known[e].terminal, math.nan) if terminal is None else terminal[e],
+                terminal=terminal[e],
                 ran=known[e].ran,
                 barred=barred,
                 **situation,
@@ -237,26 +245,11 @@ class Recorder:
 
         return tuple(trace(e) for e in range(len(known)))
 
-    def _block(self, branch: int) -> Tensor | slice:
-        """The worlds of a branch."""
-        return blocks(slice(branch, branch + 1), len(self.known))
-
-    def _place(self, ids: Tensor | slice, branch: int) -> slice | None:
-        """Where in `ids` the worlds of a branch are, side by side; None where they are not."""
-        first = branch * len(self.known)
-        if isinstance(ids, Tensor):
-            found = (ids == first).nonzero()
-            place = int(found[0]) if len(found) > 0 else -1
+    def _place(self, ids: np.ndarray | slice, branch: int) -> slice | None:
+        """Where among the worlds of branches `ids`, ascending, those of one are; None where they are not."""
+        if isinstance(ids, slice):
+            place = branch - ids.start if ids.start <= branch < ids.stop else -1
         else:
-            place = first - ids.start if ids.start <= first < ids.stop else -1
-        return slice(place, place + len(self.known)) if place >= 0 else None
-
-
-def _rest(worlds: Worlds, ids: Ids) -> tuple[Tensor, ...]:
-    """What `SITUATION` names after x and u, of worlds `ids`."""
-    return fresh(worlds.memory, ids), fresh(worlds.mode, ids), worlds.sim.save(ids)
-
-
-def _situation(worlds: Worlds, ids: Ids) -> tuple[Tensor, ...]:
-    """What `SITUATION` names, of worlds `ids`."""
-    return worlds.sim.x(ids), worlds.sim.u(ids), *_rest(worlds, ids)
+            place = int(ids.searchsorted(branch))
+            place = place if place < len(ids) and ids[place] == branch else -1
+        return slice(place * len(self.known), (place + 1) * len(self.known)) if place >= 0 else None

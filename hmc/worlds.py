@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.modes import Mode
@@ -13,12 +16,18 @@ from hmc.sim.ids import Ids, count, where
 from hmc.start import Start
 from hmc.task import Task
 
+if TYPE_CHECKING:
+    from hmc.trace import Trace
+
+Indices = NDArray[np.integer]
+Flags = NDArray[np.bool_]
+
 
 class Worlds:
     """The worlds of a simulator together with what their modes remember.
 
-    The simulator holds x, u and the engine's own history; this holds the rest of the rolled-out state:
-    the mode that ran last in each world and its memory. Branching a rollout copies both.
+    The simulator holds x, u and the engine's own history; this holds the memory of the mode that ran last
+    in each world. Branching a rollout copies both.
 
     Attributes:
         own_steps: control steps made so far, over all worlds.
@@ -29,7 +38,6 @@ class Worlds:
         self.task, self.sim = task, sim
         self.own_steps = self.nested_steps = 0
         self._all = torch.arange(sim.num_worlds, device=sim.device)
-        self.mode = torch.full((sim.num_worlds,), -1, dtype=torch.long, device=sim.device)
         self.memory = torch.zeros(sim.num_worlds, task.modes.memory_size, dtype=sim.dtype, device=sim.device)
 
     @property
@@ -44,44 +52,57 @@ class Worlds:
             self.sim.reset(start.x.expand(n, -1), start.u.expand(n, -1), ids)
         else:
             self.sim.load(start.snapshot.expand(n, -1), ids)
-        ids = where(ids)
-        self.mode[ids] = -1 if start.mode is None else start.mode
         if self.task.modes.memory_size > 0:
+            ids = where(ids)
             self.memory[ids] = 0.0
             self.memory[ids, : len(start.memory)] = start.memory
+
+    def enter(self, trace: Trace, i: int, ids: Ids) -> None:
+        """Put worlds `ids` where a trace is on arrival at its step i."""
+        n = count(ids, self.sim.num_worlds)
+        self.sim.load(trace.snapshots[i].expand(n, -1), ids)
+        if self.task.modes.memory_size > 0:
+            self.memory[where(ids)] = trace.memory[i]
 
     def branch(self, parents: Ids, children: Ids) -> None:
         """Make worlds `children` (n,) copies of worlds `parents` (n,)."""
         self.sim.load(self.sim.save(parents), children)
-        parents, children = where(parents), where(children)
-        self.mode[children] = self.mode[parents]
         if self.task.modes.memory_size > 0:
-            self.memory[children] = self.memory[parents]
+            self.memory[where(children)] = self.memory[where(parents)]
 
-    def barred(self, ids: Ids, modes: Tensor, x: Tensor, k: int) -> Tensor:
-        """Which of worlds `ids` enter a mode that the task's guards bar, (n,) bool; arguments as in `act`."""
+    def barred(self, modes: Indices, before: Indices, x: Tensor, k: int) -> Flags:
+        """Which of n worlds enter a mode that the task's guards bar, (n,) bool; arguments as of `crew`."""
         rules = self.task.rules
         assert rules is not None
-        entered = modes != self.mode[where(ids)]
-        return rules.barred(self.task.modes, entered, modes, x, torch.full_like(modes, k))
+        entered, chosen = (
+            torch.from_numpy(a).to(x.device) for a in (modes != before, modes.astype(np.int64))
+        )
+        barred = rules.barred(self.task.modes, entered, chosen, x, torch.full_like(chosen, k))
+        return barred.cpu().numpy()
 
-    def crew(self, ids: Ids, modes: Tensor) -> Crew:
-        """Who acts in worlds `ids` when their modes are `modes` (n,) long: it holds until either changes."""
-        ids, indices = where(ids), modes.unique().tolist()
-        parts = []
+    def crew(self, ids: Ids, modes: Indices, before: Indices) -> Crew:
+        """Who acts in worlds `ids`: it holds until these or their modes change.
+
+        Args:
+            ids: n worlds.
+            modes: of each, (n,).
+            before: the modes that ran last, (n,); -1 for none. One that did not run before is entered first.
+        """
+        if self.task.modes.constants is not None:
+            held = torch.from_numpy(self.task.modes.constants.take(modes)).to(self.sim.device, self.sim.dtype)
+            return Crew(len(modes), [], held[:, None].expand(-1, self.sim.nu))
+        ids, parts, new = where(ids), [], modes != before
+        indices = np.flatnonzero(np.bincount(modes)).tolist()
         for index in indices:
-            rows = slice(None) if len(indices) == 1 else (modes == index).nonzero().squeeze(1)
-            at = (
-                ids
-                if isinstance(rows, slice)
-                else rows + (ids.start or 0)
-                if isinstance(ids, slice)
-                else ids[rows]
-            )
-            entered = self.mode[at] != index
-            parts.append(
-                Part(self.task.modes[index], index, rows, at, entered if bool(entered.any()) else None)
-            )
+            if len(indices) == 1:
+                flags = self._flags(new) if new.any() else None
+                parts.append(Part(self.task.modes[index], slice(None), ids, flags))
+                continue
+            found = np.flatnonzero(modes == index)
+            rows, entered = torch.from_numpy(found).to(self.sim.device), new[found]
+            at = rows + (ids.start or 0) if isinstance(ids, slice) else ids[rows]
+            flags = self._flags(entered) if entered.any() else None
+            parts.append(Part(self.task.modes[index], rows, at, flags))
         return Crew(len(modes), parts)
 
     def act(self, crew: Crew, x: Tensor, u: Tensor, k: int) -> Tensor:
@@ -96,12 +117,17 @@ class Worlds:
         Returns:
             The inputs to apply, (n, nu). The worlds' memory is already that after the step.
         """
+        if crew.held is not None:
+            return crew.held
         if len(crew.parts) == 1:
             return self._act(crew.parts[0], x, u, k)
         action = u.new_empty(crew.size, self.sim.nu)
         for part in crew.parts:
             action[part.rows] = self._act(part, x[part.rows], u[part.rows], k)
         return action
+
+    def _flags(self, flags: Flags) -> Tensor:
+        return torch.from_numpy(flags).to(self.sim.device)
 
     def _act(self, part: Part, x: Tensor, u: Tensor, k: int) -> Tensor:
         """Inputs of worlds that are all in one mode, (n, nu)."""
@@ -120,11 +146,11 @@ class Worlds:
     def _enter(self, part: Part, x: Tensor, u: Tensor, k: Tensor) -> None:
         """Begin a mode in the worlds that enter it."""
         new, part.entered = part.entered, None
+        if self.task.modes.memory_size == 0:
+            return
         assert new is not None
         at = self._all[part.at][new]
-        self.mode[at] = part.index
-        if self.task.modes.memory_size > 0:
-            self.memory[at] = 0.0
+        self.memory[at] = 0.0
         if (size := part.mode.memory_size) > 0:
             start = part.mode.reset(x[new], u[new], k[new])
             start = _shaped(part.mode, "reset() memory", start, (len(at), size))
@@ -137,14 +163,12 @@ class Part:
 
     Attributes:
         mode: that acts.
-        index: its index.
         rows: which of the crew's n worlds they are.
         at: and which of the simulator's.
         entered: those among them that enter the mode at the next step, bool; None for none of them.
     """
 
     mode: Mode
-    index: int
     rows: Tensor | slice
     at: Tensor | slice
     entered: Tensor | None
@@ -152,10 +176,17 @@ class Part:
 
 @dataclass(frozen=True)
 class Crew:
-    """Who acts in n worlds."""
+    """Who acts in n worlds.
+
+    Attributes:
+        size: n.
+        parts: the worlds by mode.
+        held: where all modes are constant inputs, those of the worlds, (n, nu); None otherwise.
+    """
 
     size: int
     parts: list[Part]
+    held: Tensor | None = None
 
 
 def _shaped(mode: Mode, what: str, value: Tensor, shape: tuple[int, int]) -> Tensor:

@@ -88,6 +88,17 @@ def test_fourth_order():
     assert errors[1] / errors[2] == pytest.approx(16, rel=0.25)
 
 
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_what_is_differentiated_is_what_is_stepped(substeps):
+    """`advance` and `step` are the same equations, to rounding."""
+    sim = CartpoleSim(5000, substeps=substeps)
+    x = 3 * torch.randn(5000, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    u = torch.linspace(-1, 1, 5000, dtype=torch.float64)[:, None]
+    sim.reset(x, u)
+    sim.step(u)
+    assert torch.allclose(sim.x(), sim.advance(x, u), rtol=0, atol=1e-13)
+
+
 @given(states, st.floats(-1, 1))
 def test_left_and_right_are_alike(x, u):
     mirrored = run([-value for value in x], -u, 5)

@@ -106,10 +106,11 @@ def test_one_batched_call_a_mode_a_step():
     assert calls == [(0, 1), (1, 2), (2, 2)], "equal schedules and equal beginnings are one world"
 
 
+@pytest.mark.parametrize("cheap", [False, True])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_bad_action_costs_inf_and_disturbs_nobody(value):
+def test_a_bad_action_costs_inf_and_disturbs_nobody(value, cheap):
     good = evaluator(toy_task(6, [Push(1.0), Damp(), Push(0.5)]))
-    bad = evaluator(toy_task(6, [Push(1.0), Damp(), Bad(after=3, value=value)]))
+    bad = evaluator(toy_task(6, [Push(1.0), Damp(), Bad(after=3, value=value)], cheap=cheap))
     rows = all_schedules(3, 6)
     hit = (rows[:, 3:] == 2).any(1)
     costs = bad.costs(rows)
@@ -164,12 +165,13 @@ def next_step(x: Tensor, k: Tensor, steps: int) -> Tensor:
     x=st.tuples(st.floats(-2, 2), st.floats(-2, 2)),
     num_worlds=st.integers(8, 100),
     looks_ahead=st.booleans(),
+    cheap=st.booleans(),
 )
-def test_pruning_is_exact_up_to_the_bound(rank, x, num_worlds, looks_ahead):
+def test_pruning_is_exact_up_to_the_bound(rank, x, num_worlds, looks_ahead, cheap):
     rows = all_schedules(3, 4)
     plain = evaluator(toy_task(4), 81, x).costs(rows)
     bound = float(plain.sort().values[rank])
-    task = replace(toy_task(4), lower_bound=next_step if looks_ahead else None)
+    task = replace(toy_task(4, cheap=cheap), lower_bound=next_step if looks_ahead else None)
     pruning = evaluator(task, num_worlds, x)
     costs = pruning.costs(rows, bound)
     assert torch.equal(costs[plain <= bound], plain[plain <= bound])
@@ -236,10 +238,12 @@ def test_all_of_omega_takes_a_quarter_of_the_control_steps():
     trunk=st.lists(st.integers(0, 2), min_size=5, max_size=5),
     num_worlds=st.sampled_from([1, 2, 5, 64]),
     bounded=st.booleans(),
+    cheap=st.booleans(),
 )
-def test_shared_beginnings_change_no_cost(rows, trunk, num_worlds, bounded):
+def test_shared_beginnings_change_no_cost(rows, trunk, num_worlds, bounded, cheap):
     """Whatever was followed and in how many worlds: bit for bit the cost of a rollout by itself."""
-    task, start = toy_task(5, hidden=0.4), {"u": [0.7], "mode": 2, "memory": [2.0, 0.3, -0.5, 3.0], "k": 5}
+    task = toy_task(5, hidden=0.4, cheap=cheap)
+    start = {"u": [0.7], "mode": 2, "memory": [2.0, 0.3, -0.5, 3.0], "k": 5}
     rolled = evaluator(task, num_worlds, **start)
     assert rolled.follow(Schedule(tuple(trunk))) == slow_cost(task, trunk, X, **start)
     rows = torch.tensor(rows)
@@ -346,11 +350,11 @@ def test_a_trace_goes_on_from_any_step(exact, row, i, strength):
     trunk=st.lists(st.integers(0, 2), min_size=6, max_size=6),
     pick=st.integers(0, 8),
     bound=st.sampled_from([math.inf, 4.0]),
+    cheap=st.booleans(),
 )
-def test_a_schedule_of_the_last_batch_was_recorded_with_it(rows, trunk, pick, bound):
+def test_a_schedule_of_the_last_batch_was_recorded_with_it(rows, trunk, pick, bound, cheap):
     """To follow it takes no control step more, and its trace is that of a rollout of its own."""
-    task = toy_task(6)
-    rolled, alone = evaluator(task), evaluator(task)
+    rolled, alone = evaluator(toy_task(6, cheap=cheap)), evaluator(toy_task(6))
     rolled.follow(Schedule(tuple(trunk)))
     chosen = Schedule(tuple(rows[pick % len(rows)]))
     cost = float(rolled.costs(torch.tensor(rows), bound)[pick % len(rows)])
@@ -365,10 +369,15 @@ def test_a_schedule_of_the_last_batch_was_recorded_with_it(rows, trunk, pick, bo
     assert rolled.trunk.modes == chosen.modes
 
 
-@pytest.mark.parametrize("bound", [math.inf, 0.1])
-def test_among_many_the_schedule_followed_is_recorded(bound):
+@pytest.mark.parametrize("cheap", [False, True])
+@pytest.mark.parametrize("bound", [math.inf, 0.1, 3.0])
+def test_among_many_the_schedule_followed_is_recorded(bound, cheap):
     """Too many to record them all: the one that is followed goes on, wherever it is among them."""
-    rows, rolled, alone = all_schedules(3, 5), evaluator(toy_task(5), 300), evaluator(toy_task(5))
+    rows, rolled, alone = (
+        all_schedules(3, 5),
+        evaluator(toy_task(5, cheap=cheap), 300),
+        evaluator(toy_task(5)),
+    )
     rolled.follow(Schedule((0, 1, 0, 0, 0)))
     rolled.costs(rows[::2])
     for modes in ((2, 1, 1, 0, 2), (0, 1, 2, 2, 0), (0, 0, 0, 0, 2)):
@@ -385,15 +394,3 @@ def test_a_trace_of_a_diverging_schedule_ends_there():
     assert len(whole.x) == len(whole.stage) + 1 < 7
     assert not whole.x[-1].isfinite().all()
     assert whole.x[:-1].isfinite().all()
-
-
-@pytest.mark.parametrize("part", ["actions", "memory"])
-def test_a_mode_of_the_wrong_shape_is_named(part):
-    class Wrong(Ramp):
-        name = "wrong"
-
-        def act(self, x, u, memory, k):
-            return (u[:, [0, 0]], memory) if part == "actions" else (u, memory[:, :1])
-
-    with pytest.raises(ValueError, match=rf"mode 'wrong': act\(\) {part} have shape .*expected \(1, "):
-        evaluator(toy_task(6, [Wrong()])).cost(Schedule((0,) * 6))

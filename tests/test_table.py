@@ -15,31 +15,32 @@ from hmc.table import Table
 
 @pytest.mark.parametrize("num_modes", [2, 256, 257, 70_000])
 @given(data=st.data())
-def test_keys_are_equal_where_schedules_are(num_modes, data):
-    rows = st.lists(st.integers(0, num_modes - 1), min_size=4, max_size=4)
-    schedules = data.draw(st.lists(rows, min_size=1, max_size=8))
+def test_rows_are_equal_where_schedules_are(num_modes, data):
+    modes = st.lists(st.integers(0, num_modes - 1), min_size=4, max_size=4)
+    schedules = data.draw(st.lists(modes, min_size=1, max_size=8))
     schedules += [[0, 0, 0, 0], [num_modes - 1, 0, 0, 0], [0, 0, 0, num_modes - 1]]
-    keys = Table(num_modes, 1).keys(torch.tensor(schedules))
-    for a, one in zip(keys, schedules, strict=True):
-        for b, other in zip(keys, schedules, strict=True):
+    table = Table(num_modes, 1)
+    rows = table.rows(torch.tensor(schedules)).tolist()
+    for a, one in zip(rows, schedules, strict=True):
+        for b, other in zip(rows, schedules, strict=True):
             assert (a == b) == (one == other)
+    assert table.rows(torch.tensor(schedules[::-1])).tolist() == rows[::-1]
 
 
 def test_a_pruned_cost_answers_only_those_who_have_no_use_for_it():
     table = Table(3, 2)
-    keys = table.keys(torch.tensor([[0, 1], [1, 1], [2, 1]]))
+    rows = table.rows(torch.tensor([[0, 1], [1, 1], [2, 1], [0, 1]]))
+    assert rows.tolist() == [0, 1, 2, 0]
     table.learn(
-        keys[:2], np.array([5.0, 7.0]), np.array([False, True]), np.array([[2.0, 3.0], [math.nan] * 2])
+        rows[:2], np.array([5.0, 7.0]), np.array([False, True]), np.array([[2.0, 3.0], [math.nan] * 2])
     )
-    rows = table.find([*keys, keys[0]])
-    assert rows.tolist() == [0, 1, -1, 0]
     assert table.missing(rows, 6.0).tolist() == [False, False, True, False]
     np.testing.assert_equal(table.costs(rows, 6.0), [5.0, math.inf, math.nan, 5.0])
     assert table.missing(rows, 7.0).tolist() == [False, True, True, False]
     np.testing.assert_equal(table.costs(rows, math.inf), [5.0, math.nan, math.nan, 5.0])
     assert table.terms(0).tolist() == [2.0, 3.0]
-    table.learn(keys[1:2], np.array([9.0]), np.array([False]), np.array([[4.0, 5.0]]))
-    np.testing.assert_equal(table.costs(table.find(keys), math.inf), [5.0, 9.0, math.nan])
+    table.learn(rows[1:2], np.array([9.0]), np.array([False]), np.array([[4.0, 5.0]]))
+    np.testing.assert_equal(table.costs(rows, math.inf), [5.0, 9.0, math.nan, 5.0])
 
 
 def test_it_grows():
@@ -47,7 +48,7 @@ def test_it_grows():
     every = torch.cartesian_prod(*[torch.arange(5)] * 4)
     for part in every.split(100):
         cost = part.double().numpy() @ [1.0, 10.0, 100.0, 1000.0]
-        table.learn(table.keys(part), cost, np.zeros(len(part), dtype=bool), cost[:, None])
+        table.learn(table.rows(part), cost, np.zeros(len(part), dtype=bool), cost[:, None])
     shuffled = every[torch.randperm(len(every))]
     expected = shuffled.double().numpy() @ [1.0, 10.0, 100.0, 1000.0]
-    np.testing.assert_array_equal(table.costs(table.find(table.keys(shuffled)), math.inf), expected)
+    np.testing.assert_array_equal(table.costs(table.rows(shuffled), math.inf), expected)

@@ -32,8 +32,9 @@ class ToySim:
         num_worlds: int,
         hidden: float | Sequence[float] = 0.0,
         blow_up: float | Sequence[float] = math.inf,
+        cheap: bool = False,
     ):
-        self.num_worlds = num_worlds
+        self.num_worlds, self.cheap = num_worlds, cheap
         self.hidden, self.blow_up = (
             torch.tensor(value, dtype=torch.float64).expand(num_worlds) for value in (hidden, blow_up)
         )

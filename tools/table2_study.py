@@ -116,13 +116,14 @@ def executed_costs(task: Task, cfg: RunCfg, rules: Sequence[Rule], seed: int) ->
     sim = task.make_sim(len(rules))
     worlds, follow = Worlds(task, sim), Sequencer(rules, cfg.task.command)
     worlds.reset(make_start(task, sim, *disturbed_start(cfg.start, seed)), None)
-    cost = torch.zeros(len(rules), dtype=torch.float64)
+    cost, before = torch.zeros(len(rules), dtype=torch.float64), np.full(len(rules), -1)
     for k in range(round(cfg.seconds / sim.dt)):
         x, u_prev = sim.x(), sim.u()
         lost = ~finite(x)
         cost[lost] = math.inf
         x = torch.where(lost[:, None], x.new_tensor(0.0), x)
-        u = worlds.act(worlds.crew(None, follow(x, k)), x, u_prev, k)
+        modes = follow(x, k).numpy()
+        u, before = worlds.act(worlds.crew(None, modes, before), x, u_prev, k), modes
         cost += task.cost.stage_terms(x, u, u_prev, torch.full((len(x),), k)).sum(1) * sim.dt
         sim.step(u)
     return cost

@@ -25,6 +25,10 @@ class Sim(Protocol):
     `load` of a saved row into any world and the same inputs give the same trajectory, bit for bit on
     the CPU engines. Branching a rollout is `load(ids, save(parent)[...])`.
 
+    A simulator may have an attribute `cheap`, True where a control step of all worlds takes less time than to
+    ask a cost what it cost: rollouts then ask for several steps at once, make some in vain, and keep the
+    worlds that go on side by side.
+
     A world whose state stops being finite stays so, quietly, and never disturbs another one: the
     caller finds it by looking at x.
     """

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hmc.cost import Cost
-from hmc.modes import Mode, ModeSet
+from hmc.modes import ConstantInput, ModeSet
 from hmc.sim.cartpole import CartpoleParams, CartpoleSim
 from hmc.task import Task
 
@@ -49,16 +49,6 @@ class CartpoleCfg:
             raise ValueError(f"cartpole num_modes must be at least 2 inputs, got {self.num_modes}")
 
 
-class ConstantInput(Mode):
-    """The same input at every step, whatever the state."""
-
-    def __init__(self, name: str, value: float):
-        self.name, self.value = name, value
-
-    def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.full_like(u, self.value), memory
-
-
 def cartpole(cfg: CartpoleCfg | None = None) -> Task:
     r"""The swing-up task.
 
@@ -72,12 +62,14 @@ def cartpole(cfg: CartpoleCfg | None = None) -> Task:
         modes=ModeSet([ConstantInput(f"{cfg.params.gear * level:.3g} N", level) for level in levels]),
         cost=Cost(
             stage={
-                "angle": lambda x, u, u_prev, k: cfg.weight_angle * (x[:, 0].cos() - 1) ** 2,
-                "position": lambda x, u, u_prev, k: cfg.weight_position * x[:, 1] ** 2,
-                "velocity": lambda x, u, u_prev, k: cfg.weight_velocity * (x[:, 2] ** 2 + x[:, 3] ** 2),
-                "input": lambda x, u, u_prev, k: cfg.weight_input * u[:, 0] ** 2,
+                "angle": lambda x, u, u_prev, k: cfg.weight_angle * (x[:, 0].cos() - 1).square(),
+                "position": lambda x, u, u_prev, k: cfg.weight_position * x[:, 1].square(),
+                "velocity": lambda x, u, u_prev, k: (
+                    cfg.weight_velocity * (x[:, 2].square() + x[:, 3].square())
+                ),
+                "input": lambda x, u, u_prev, k: cfg.weight_input * u[:, 0].square(),
             },
-            terminal={"final angle": lambda x, k: cfg.weight_final * (x[:, 0].cos() - 1) ** 2},
+            terminal={"final angle": lambda x, k: cfg.weight_final * (x[:, 0].cos() - 1).square()},
             nonnegative=True,
         ),
         horizon=cfg.horizon,
