@@ -24,6 +24,9 @@ CURVES = {
     "/success/way": "reached from the open grid",
     "/success/home": "reached from four legs",
     "/success/recorded": "caught in flips",
+    "/success/standing": "done from four legs",
+    "/success/fallen": "done from where it fell",
+    "/success/stances": "done from two legs",
 }
 
 
@@ -80,14 +83,18 @@ def main(args: Args) -> None:
             if tag in run.lines:
                 steps, values = run.lines[tag]
                 axis.plot(steps * run.batch / 1e6, values, color=f"C{number}", label=words)
-        steps, values = run.lines["/success/frontier"]
-        axis.plot(steps * run.batch / 1e6, values, color="grey", linestyle=":", label="furthest open place")
+        if "/success/frontier" in run.lines:  # the curriculum's places: 1 the stance, -1 the other one
+            steps, values = run.lines["/success/frontier"]
+            axis.plot(
+                steps * run.batch / 1e6, values, color="grey", linestyle=":", label="furthest open place"
+            )
         axis.set_title(run.mode)
         axis.set_xlabel("environment steps [million]")
-        axis.set_ylim(-1.05, 1.05)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8, loc="lower right")
-    axes[0, 0].set_ylabel("share of episodes; place")
+    places = any("/success/frontier" in run.lines for run in runs)
+    axes[0, 0].set_ylim(-1.05 if places else -0.05, 1.05)
+    axes[0, 0].set_ylabel("share of episodes; place" if places else "share of episodes")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     save(figure, args.out)
     print(args.out)
