@@ -10,7 +10,7 @@ import torch
 from hmc.go2 import model as go2
 from hmc.go2.course import CourseCfg, GoalCfg, course_cost, towards
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STAND
-from tools.showreel import ARRIVED, DOWN, Course, laid_down
+from tools.showreel import ARRIVED, DOWN, HOLD, Course, laid_down
 
 GOALS = (
     GoalCfg("stand", 1.0),
@@ -123,12 +123,27 @@ def test_a_goal_that_is_missed_and_the_course_begins_anew():
     assert follow(Course(CFG), FOOTSTAND, 1.0) == [49]
 
 
+def test_what_comes_next_may_begin_early():
+    course = Course(CFG)
+    follow(course, STAND, HOLD)
+    assert not follow(course, FOOTSTAND, 1.0 - HOLD)
+    assert course.done == 1, "it stood for long enough"
+    follow(course, STAND, 2.0, 1.0, 2.0)
+    follow(course, FOOTSTAND, 1.0)
+    follow(course, HANDSTAND, 1.5)
+    assert follow(course, FOOTSTAND, 0.5) == [24], "the last goal is there to stay"
+    short = Course(CFG)
+    follow(short, STAND, HOLD - 0.02)
+    assert follow(short, FOOTSTAND, 1.0 - HOLD + 0.02), "it did not"
+
+
 def test_a_fall_and_the_course_begins_anew():
     course = Course(CFG)
     lying = at(STAND.state(), 0.0, 0.0)[0]
     lying[2] -= 0.3
-    assert not [step for step in range(49) if course.advance(lying)], "before the first goal it may lie"
-    follow(course, STAND, 0.02)
+    assert not [step for step in range(25) if course.advance(lying)], "before the first goal it may lie"
+    follow(course, STAND, HOLD)
+    assert course.done == 1
     began = [step for step in range(60) if course.advance(lying)]
     assert began == [round(DOWN / go2.DT) - 1]
     assert (course.k, course.tries) == (60 - began[0] - 1, 2)

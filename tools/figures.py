@@ -22,6 +22,8 @@ COLORS = {
     "getup": "#6d597a",
     "stand": "#adb5bd",
     "walk": "#457b9d",
+    "roll": "#b56576",
+    "home": "#dee2e6",
 }
 
 

@@ -33,6 +33,7 @@ from tools.closed_loop import MODEL, RunCfg, study_cfg  # noqa: E402
 from tools.study import Workers, run_all, write_json  # noqa: E402
 
 ARRIVED = 0.3  # m: so near to its place a robot is there
+HOLD = 0.5  # s that a goal is held without a break, to be reached; the last one, at the end of its time
 DOWN = 0.5  # s on the ground, where it should not be, and the course begins anew
 SETTLE = 1.0  # s in which the robot that is laid on its side comes to rest
 
@@ -93,7 +94,8 @@ class Course:
     def __init__(self, cfg: CourseCfg):
         self.goals, self.ends = cfg.goals, cfg.ends()
         self.k, self.tries, self.done, self.furthest = 0, 1, 0, 0
-        self._down = 0
+        self._down = self._held = 0
+        self._reached = False
 
     @property
     def goal(self) -> GoalCfg:
@@ -110,18 +112,22 @@ class Course:
         self.k += 1
         lies = bool(go2.clearances(x[None])["trunk"][0] < 0.01)
         self._down = self._down + 1 if lies and self.done > 0 else 0
+        self._held = self._held + 1 if self._holds(x) else 0
+        # what comes next may begin before the time is over; the last goal is there to stay
+        last = self.done == len(self.goals) - 1
+        self._reached = self._held * go2.DT >= HOLD or (self._reached and not last)
         if self._down * go2.DT < DOWN:
             if self.k < self.ends[self.done]:
                 return False
-            if self._reached(x):
-                self.done += 1
+            if self._reached:
+                self.done, self._held, self._reached = self.done + 1, 0, False
                 self.furthest = max(self.furthest, self.done)
                 return False
-        self.k, self.done, self._down = 0, 0, 0
+        self.k, self.done, self._down, self._held, self._reached = 0, 0, 0, 0, False
         self.tries += 1
         return True
 
-    def _reached(self, x: Tensor) -> bool:
+    def _holds(self, x: Tensor) -> bool:
         place = torch.tensor(self.goal.at or x[:2].tolist(), dtype=x.dtype)
         return bool(HOLDS[self.goal.hold].held(x[None])[0]) and float((x[:2] - place).norm()) < ARRIVED
 

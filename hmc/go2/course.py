@@ -179,7 +179,7 @@ def towards(cfg: CourseCfg) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 0) -> Task:
-    """The course with modes roll, getup, stand, walk, foot, jump and hand.
+    """The course with modes roll, home, getup, stand, walk, foot, jump and hand.
 
     Nobody says which one runs when. A foot stand may begin on four legs or on two, a jump in the foot stand
     only: what the policies were never trained on need not be rolled out.
@@ -195,6 +195,7 @@ def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 
     modes = ModeSet(
         [
             Motion("roll", roll),
+            Motion("home", go2.HOME.double()[None]),
             Policy(policy_path("getup"), threads=threads),
             Policy(policy_path("stand"), name="stand", threads=threads),
             Policy(policy_path("walk"), threads=threads, command=towards(cfg)),
