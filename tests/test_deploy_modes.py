@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from importlib import resources
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -23,8 +21,10 @@ from hmc.go2.network import LOWER, UPPER, Network
 from hmc.go2.network import observe as observe_in_numpy
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
+from hmc.go2.task import policy_path
 
-FILES = sorted(Path(str(resources.files("hmc.go2"))).glob("policies/*.onnx"))
+# of the policies that deploy/ runs
+FILES = [policy_path(name) for name in ("footstand", "handstand")]
 RULES = PlanCfg(expires=10, jump=8)
 
 
