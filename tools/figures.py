@@ -23,7 +23,6 @@ COLORS = {
     "stand": "#adb5bd",
     "walk": "#457b9d",
     "roll": "#b56576",
-    "home": "#dee2e6",
 }
 
 

@@ -15,7 +15,7 @@ from hmc.go2 import facts
 from hmc.go2 import model as go2
 from hmc.go2.observe import anchor_of
 from hmc.go2.policy import Policy
-from hmc.go2.stances import FOOTSTAND
+from hmc.go2.stances import FOOTSTAND, MIN_STAND
 from hmc.go2.task import (
     FOOT_TARGET,
     HAND_TARGET,
@@ -179,10 +179,10 @@ def towards(cfg: CourseCfg) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 0) -> Task:
-    """The course with modes roll, home, getup, stand, walk, foot, jump and hand.
+    """The course with modes roll, getup, stand, walk, foot, jump and hand.
 
     Nobody says which one runs when. A foot stand may begin on four legs or on two, a jump in the foot stand
-    only: what the policies were never trained on need not be rolled out.
+    only, a roll wherever the robot does not stand: all else need not be rolled out.
 
     Args:
         cfg: settings.
@@ -195,7 +195,6 @@ def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 
     modes = ModeSet(
         [
             Motion("roll", roll),
-            Motion("home", go2.HOME.double()[None]),
             Policy(policy_path("getup"), threads=threads),
             Policy(policy_path("stand"), name="stand", threads=threads),
             Policy(policy_path("walk"), threads=threads, command=towards(cfg)),
@@ -207,7 +206,7 @@ def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 
     rules = Rules(
         dwell={"jump": jump.dwell} if jump.dwell else {},
         guards={
-            "roll": lambda x, k: go2.vertical(x[:, 3:7])[:, 2] < 0.3,
+            "roll": lambda x, k: x[:, 2] < MIN_STAND,
             "walk": lambda x, k: _on_legs(x),
             "foot": lambda x, k: _on_legs(x) | (FOOTSTAND.uprightness(x) > 0.3),
             "jump": lambda x, k: FOOTSTAND.held(x),
