@@ -16,6 +16,7 @@ from hmc.go2.stances import STANCES
 from train.env import both_sides
 from train.legs import LegsCfg
 from train.stance import StanceCfg
+from train.unified import UnifiedCfg
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -59,9 +60,9 @@ class PpoCfg:
 
 @dataclass(frozen=True)
 class TrainCfg:
-    """An experiment file in cfg/; which of the two below it is depends on the mode."""
+    """An experiment file in cfg/; which of those below it is depends on the mode."""
 
-    env: StanceCfg | LegsCfg
+    env: StanceCfg | LegsCfg | UnifiedCfg
     ppo: PpoCfg = field(default_factory=PpoCfg)
 
 
@@ -79,9 +80,17 @@ class LegsTraining(TrainCfg):
     env: LegsCfg
 
 
+@dataclass(frozen=True)
+class UnifiedTraining(TrainCfg):
+    """Of the policy without modes."""
+
+    env: UnifiedCfg
+
+
 def read_training(mode: str, name: str, overrides: Sequence[str] = ()) -> TrainCfg:
     """The experiment file cfg/NAME.toml of a mode."""
-    return load(ROOT / "cfg" / f"{name}.toml", StanceTraining if mode in STANCES else LegsTraining, overrides)
+    legs: type[TrainCfg] = UnifiedTraining if mode == "unified" else LegsTraining
+    return load(ROOT / "cfg" / f"{name}.toml", StanceTraining if mode in STANCES else legs, overrides)
 
 
 def rsl_config(cfg: PpoCfg) -> dict[str, Any]:

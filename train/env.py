@@ -63,8 +63,11 @@ class StartStates(Protocol):
         shares: of each kind, (kinds,).
     """
 
-    rates: Tensor
-    shares: Tensor
+    @property
+    def rates(self) -> Tensor: ...
+
+    @property
+    def shares(self) -> Tensor: ...
 
     @property
     def kinds(self) -> Sequence[str]: ...

@@ -12,10 +12,13 @@ from hmc.sim.make import make_sim
 from train.env import Go2Env
 from train.legs import LegsCfg, LegsEnv
 from train.stance import StanceCfg, StanceEnv
+from train.unified import UnifiedCfg, UnifiedEnv
+
+AnyCfg = StanceCfg | LegsCfg | UnifiedCfg
 
 
 def make_env(
-    cfg: StanceCfg | LegsCfg,
+    cfg: AnyCfg,
     engine: str = "auto",
     *,
     device: str | None = None,
@@ -41,6 +44,8 @@ def make_env(
     return env_on(cfg, sim, zeros)
 
 
-def env_on(cfg: StanceCfg | LegsCfg, sim: Sim, zeros: Tensor | None = None) -> Go2Env:
+def env_on(cfg: AnyCfg, sim: Sim, zeros: Tensor | None = None) -> Go2Env:
     """The environment in the worlds of an engine; `zeros` as of `Go2Env`."""
-    return LegsEnv(cfg, sim, zeros) if isinstance(cfg, LegsCfg) else StanceEnv(cfg, sim, zeros)
+    if isinstance(cfg, StanceCfg):
+        return StanceEnv(cfg, sim, zeros)
+    return LegsEnv(cfg, sim, zeros) if isinstance(cfg, LegsCfg) else UnifiedEnv(cfg, sim, zeros)

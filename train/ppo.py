@@ -43,7 +43,7 @@ class Args:
         play: a checkpoint to record an episode of, instead of training.
     """
 
-    mode: Literal["handstand", "footstand", "stand", "getup", "walk"]
+    mode: Literal["handstand", "footstand", "stand", "getup", "walk", "unified"]
     stage: str = ""
     engine: Literal["auto", "mujoco", "warp"] = "auto"
     device: str = "auto"

@@ -7,7 +7,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from hmc.go2.stances import STANCES
+from hmc.go2.stances import STANCES, Stance
 from hmc.sim.base import Sim
 from train.env import EnvCfg, Gap, Go2Env
 from train.rewards import RewardCfg, stage_rewards
@@ -60,10 +60,19 @@ class StanceEnv(Go2Env):
         )
 
     def fallen(self, x: Tensor, gap: Gap) -> Tensor:
-        touch = (gap["trunk"] < 0) | (gap["thigh"] < 0).any(1) | (gap["calf"] < 0).any(1)
-        low = (x[:, 2] < self.cfg.min_height) | (self.stance.uprightness(x) < self.cfg.min_upright)
         late = self.episode_length_buf * self.sim.dt > self.cfg.grace
-        return touch | (low & (late | (self._kind == STANCE)))
+        lies = low(x, self.stance, self.cfg.min_height, self.cfg.min_upright)
+        return touches(gap) | (lies & (late | (self._kind == STANCE)))
 
     def good(self, x: Tensor, gap: Gap) -> Tensor:
         return self.stance.held(x, gap)
+
+
+def touches(gap: Gap) -> Tensor:
+    """Whether trunk, thigh or shin touch the ground, (n,) bool."""
+    return (gap["trunk"] < 0) | (gap["thigh"] < 0).any(1) | (gap["calf"] < 0).any(1)
+
+
+def low(x: Tensor, stance: Stance, height: float, upright: float) -> Tensor:
+    """Whether the base is below a height [m], or the cosine of its tilt below a limit, (n,) bool."""
+    return (x[:, 2] < height) | (stance.uprightness(x) < upright)

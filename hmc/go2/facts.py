@@ -46,7 +46,10 @@ SUBSTEPS = 4  # physics steps a control step
 OBS_SIZE = 48
 OBS_VERSION = 1  # of `hmc.go2.observe`
 # what a learned mode is commanded by, at the end of its observation; its base position is only a height
-COMMANDS = {"walk": ("forward [m/s]", "sideways [m/s]", "turn [rad/s]")}
+COMMANDS = {
+    "walk": ("forward [m/s]", "sideways [m/s]", "turn [rad/s]"),
+    "unified": ("-1: foot stand, +1: handstand",),
+}
 
 
 def contract() -> dict[str, Any]:

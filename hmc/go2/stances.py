@@ -106,4 +106,4 @@ FOOTSTAND = Stance("footstand", -1, go2.FOOTSTAND, go2.REAR, go2.FRONT)
 STANCES = {stance.name: stance for stance in (HANDSTAND, FOOTSTAND)}
 STAND = Stand(go2.HOME)
 # what the learned modes hold, or return to
-HOLDS: dict[str, Stance | Stand] = {**STANCES, "stand": STAND, "getup": STAND, "walk": STAND}
+HOLDS: dict[str, Stance | Stand] = {**STANCES, **dict.fromkeys(("stand", "getup", "walk", "unified"), STAND)}

@@ -1,0 +1,162 @@
+"""The baseline without modes: one policy that holds both stances and flips when it is told to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from hmc.go2.stances import FOOTSTAND, HANDSTAND, STAND
+from hmc.sim.base import Sim
+from train.env import EnvCfg, Gap, Go2Env, Start
+from train.rewards import RewardCfg, stage_rewards
+from train.stance import low, touches
+from train.starts import KINDS, STANCE, Starts, StartsCfg
+
+GOALS = (FOOTSTAND, HANDSTAND)  # command -1 and +1
+FLIP = len(GOALS) * len(KINDS)  # kind of start: the foot stand, which is told to flip
+MIRROR = (1.0,)  # of the command
+
+
+@dataclass(frozen=True)
+class UnifiedCfg(EnvCfg):
+    """The environment of the whole timeline; see `EnvCfg` too.
+
+    Attributes:
+        mode: unified.
+        shares: of episodes in which the foot stand is asked for, the handstand, and first one, then the
+            other.
+        told: seconds, uniform, after which the latter are told to flip.
+        grace: seconds before height and tilt end an episode that did not begin in the stance asked for, or
+            since it was told to flip.
+        min_height: base height under which an episode ends [m].
+        min_upright: cosine of the tilt under which an episode ends.
+        rewards: weights, those of the stance that is asked for.
+        footstand: how episodes of the foot stand begin.
+        handstand: of the handstand.
+    """
+
+    mode: Literal["unified"]
+    shares: tuple[float, float, float] = (0.3, 0.4, 0.3)
+    told: tuple[float, float] = (0.2, 2.0)
+    grace: float = 1.5
+    min_height: float = 0.44
+    min_upright: float = 0.6
+    rewards: RewardCfg = field(default_factory=RewardCfg)
+    footstand: StartsCfg = field(default_factory=StartsCfg)
+    handstand: StartsCfg = field(default_factory=StartsCfg)
+
+
+class UnifiedStarts:
+    """Draws start states of both stances; each has its own curriculum."""
+
+    kinds = (*(f"{goal.name}_{kind}" for goal in GOALS for kind in KINDS), "flip")
+
+    def __init__(self, cfg: UnifiedCfg, device: torch.device):
+        self.device = device
+        self._goals = torch.tensor(cfg.shares, device=device)
+        self.stances = [Starts(FOOTSTAND, cfg.footstand, device), Starts(HANDSTAND, cfg.handstand, device)]
+        upright = StartsCfg(stance=1.0, home=0.0)
+        self._flip = Starts(FOOTSTAND, upright, device)
+        self._sources = (*self.stances, self._flip)
+
+    @property
+    def rates(self) -> Tensor:
+        """Success of each kind lately, (kinds,)."""
+        return torch.cat([*(starts.rates for starts in self.stances), self._flip.rates[:1]])
+
+    @property
+    def shares(self) -> Tensor:
+        """Of each kind, (kinds,)."""
+        each = [goal * starts.shares for goal, starts in zip(self._goals, self.stances, strict=False)]
+        return torch.cat([*each, self._goals[2:]])
+
+    def draw(self, n: int) -> Start:
+        """The next n starts."""
+        # nobody flips who cannot rise into the handstand
+        ready = self.stances[1].frontier() <= Starts.HORIZONTAL
+        goal = torch.multinomial(self._goals[: 3 if ready else 2], n, replacement=True)
+        drawn = [source.draw(n) for source in self._sources]
+        x, u, kind, cell = (
+            torch.stack(parts)[goal, torch.arange(n, device=self.device)]
+            for parts in zip(*drawn, strict=True)
+        )
+        return Start(x, u, kind + goal * len(KINDS), cell)
+
+    def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
+        """Learn from ended episodes: their kind, cell and whether they ended as asked, all (n,)."""
+        for goal, source in enumerate(self._sources):
+            own = torch.div(kind, len(KINDS), rounding_mode="floor") == goal
+            source.report(kind[own] % len(KINDS), cell[own], success[own])
+
+    def log(self) -> dict[str, float]:
+        """How far each way is open."""
+        return {f"{starts.stance.name}_frontier": starts.frontier() for starts in self.stances}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What a checkpoint must keep."""
+        states = enumerate(source.state_dict() for source in self._sources)
+        return {f"{goal}_{key}": value for goal, state in states for key, value in state.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from a checkpoint."""
+        for goal, source in enumerate(self._sources):
+            source.load_state_dict({key: state[f"{goal}_{key}"] for key in source.state_dict()})
+
+
+class UnifiedEnv(Go2Env):
+    """Learn to hold the stance that is asked for, and to get there from the other one.
+
+    The command is one number, -1 for the foot stand and +1 for the handstand. Falls and rewards are those
+    of the stance that is asked for; an episode that times out is a success if that is held then.
+
+    Args:
+        cfg: what to learn and from where.
+        sim: `cfg.worlds` worlds.
+        zeros: error of each joint's zero in each world (worlds, 12) [rad]; None for none.
+    """
+
+    cfg: UnifiedCfg
+
+    def __init__(self, cfg: UnifiedCfg, sim: Sim, zeros: Tensor | None = None):
+        self._told = torch.zeros(sim.num_worlds, dtype=torch.long, device=sim.device)  # step of the command
+        super().__init__(
+            cfg, sim, STAND, UnifiedStarts(cfg, sim.device), cfg.rewards.termination, zeros, MIRROR
+        )
+
+    @property
+    def _hand(self) -> Tensor:
+        """Worlds in which the handstand is asked for, (n,) bool."""
+        return self.command[:, 0] > 0
+
+    def rewards(self, x: Tensor, before: Tensor, u: Tensor, u_prev: Tensor, gap: Gap) -> dict[str, Tensor]:
+        foot, hand = (
+            stage_rewards(self.cfg.rewards, goal, x, before, u, u_prev, self._anchor, self.sim.dt, gap)
+            for goal in GOALS
+        )
+        terms = {name: torch.where(self._hand, hand[name], foot[name]) for name in hand}
+        now = (self._kind == FLIP) & (self.episode_length_buf == self._told)
+        self.command = torch.where(now[:, None], 1.0, self.command)
+        return terms
+
+    def fallen(self, x: Tensor, gap: Gap) -> Tensor:
+        foot, hand = (low(x, goal, self.cfg.min_height, self.cfg.min_upright) for goal in GOALS)
+        lies = torch.where(self._hand, hand, foot)
+        flips = (self._kind == FLIP) & self._hand
+        since = self.episode_length_buf - torch.where(flips, self._told, 0)
+        late = since * self.sim.dt > self.cfg.grace
+        began = (self._kind % len(KINDS) == STANCE) & ~flips
+        return touches(gap) | (lies & (late | began))
+
+    def good(self, x: Tensor, gap: Gap) -> Tensor:
+        return torch.where(self._hand, HANDSTAND.held(x, gap), FOOTSTAND.held(x, gap))
+
+    def _reset(self, ids: Tensor) -> None:
+        super()._reset(ids)
+        first, last = (seconds / self.sim.dt for seconds in self.cfg.told)
+        self._told[ids] = (first + (last - first) * torch.rand(len(ids), device=self.device)).long()
+        kind = self._kind[ids]
+        hand = (kind >= len(KINDS)) & (kind != FLIP)
+        self.command = self.command.index_copy(0, ids, torch.where(hand, 1.0, -1.0)[:, None])
