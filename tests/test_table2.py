@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from hmc.go2.network import Network
+from hmc.go2.observe import anchor_of
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import flip_task
 from tests.test_flip import SHORT
@@ -24,8 +28,11 @@ from tools.table2_study import (
     Rule,
     Sequencer,
     Table2Cfg,
+    controller,
     executed_costs,
     jobs,
+    orders,
+    told,
     tune,
     work,
 )
@@ -52,9 +59,11 @@ TINY = (
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory) -> tuple[str, ...]:
-    path = write_random_policy(tmp_path_factory.mktemp("policies") / "random.onnx", hidden=(8,))
+    folder = tmp_path_factory.mktemp("policies")
+    path = write_random_policy(folder / "random.onnx", hidden=(8,))
+    one = write_random_policy(folder / "unified.onnx", hidden=(8,), mode="unified")
     flip = (*SHORT, f"task.foot={path}", f"task.hand={path}")
-    return (*TINY, *(f"flip.{item}" for item in flip))
+    return (*TINY, f"unified={one}", *(f"flip.{item}" for item in flip))
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +98,30 @@ def test_tuning_costs_are_those_of_a_run(cfg):
 
         control = chosen(task.modes, choose)
         assert run(control, task.cost, cfg.flip, 7).cost == pytest.approx(cost, rel=1e-9)
+    for rule in orders(cfg):
+        control, task = controller(cfg, {"ppo": rule}, Job("ppo", 7))
+        cost = tune(replace(cfg, tuning_seeds=(7,)), [rule], told(cfg))[1]
+        assert run(control, task.cost, cfg.flip, 7).cost == pytest.approx(cost, rel=1e-9)
     best, cost = tune(cfg, rules)
     assert best == rules[int(costs.argmin())]
     assert cost == pytest.approx(float(costs.min()))
+
+
+def test_one_policy_is_told_what_the_moment_wants(cfg):
+    """The same network does something else from the command on, and nothing else does."""
+    foot, hand = told(cfg)
+    x = FOOTSTAND.state()[None]
+    u, k = x[:, 7:19], torch.zeros(1, dtype=torch.long)
+    acts = [mode.act(x, u, mode.reset(x, u, k), k)[0] for mode in (foot, hand)]
+    assert not torch.equal(*acts)
+    network = Network(cfg.unified)
+    for action, wanted in zip(acts, (-1.0, 1.0), strict=True):
+        expected = network.act(x.numpy(), u.numpy(), anchor_of(x).numpy(), np.array([[wanted]]))
+        assert action.numpy() == pytest.approx(expected)
+    control, _ = controller(cfg, {"ppo": Rule(2)}, Job("ppo", 7))
+    told_at = [control(x[0], u[0], None).mode for _ in range(6)]
+    command = cfg.flip.task.command
+    assert told_at == ["told foot" if k < command - 2 else "told hand" for k in range(6)]
 
 
 def test_bad_settings():

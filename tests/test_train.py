@@ -19,6 +19,7 @@ from train import play, ppo
 from train.config import StanceTraining, read_training, rsl_config
 from train.runner import read_checkpoint
 from train.starts import Starts
+from train.unified import UnifiedCfg
 
 
 @pytest.fixture(scope="module")
@@ -311,10 +312,13 @@ def test_only_the_first_process_writes(tmp_path):
 
 def test_experiment_files():
     kinds = ("stance", "way", "home", "recorded", "standing", "fallen", "stances")
-    for name in ("handstand", "footstand", "handstand_robust", "footstand_robust", "stand", "getup", "walk"):
+    stances = ("handstand", "footstand", "handstand_robust", "footstand_robust")
+    for name in (*stances, "stand", "getup", "walk", "unified"):
         cfg = read_training(mode := name.removesuffix("_robust"), name)
         assert cfg.env.mode == mode
-        assert sum(getattr(cfg.env.starts, kind, 0.0) for kind in kinds) == pytest.approx(1)
+        env = cfg.env
+        for starts in (env.footstand, env.handstand) if isinstance(env, UnifiedCfg) else (env.starts,):
+            assert sum(getattr(starts, kind, 0.0) for kind in kinds) == pytest.approx(1)
         assert rsl_config(cfg.ppo)["algorithm"]["learning_rate"] == cfg.ppo.learning_rate
 
 

@@ -10,17 +10,20 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from hmc.go2.facts import OBS_SIZE, contract
-from hmc.go2.stances import HANDSTAND
+from hmc.go2.facts import COMMANDS, OBS_SIZE, contract
+from hmc.go2.stances import HOLDS
 
 HIDDEN = (256, 128, 64)
 
 
-def write_random_policy(path: Path, hidden: tuple[int, ...] = HIDDEN, seed: int = 0) -> Path:
-    """Write a handstand policy with random weights and its contract to `path`, which is given back."""
+def write_random_policy(
+    path: Path, hidden: tuple[int, ...] = HIDDEN, seed: int = 0, mode: str = "handstand"
+) -> Path:
+    """Write a policy with random weights and its contract to `path`, which is given back."""
+    command = COMMANDS.get(mode, ())
     rng = np.random.default_rng(seed)
     nodes, weights, last = [], [], "obs"
-    sizes = [OBS_SIZE, *hidden, 12]
+    sizes = [OBS_SIZE + len(command), *hidden, 12]
     for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
         w = rng.uniform(-1, 1, (n_out, n_in)).astype(np.float32) / np.sqrt(n_in).astype(np.float32)
         weights += [
@@ -36,12 +39,13 @@ def write_random_policy(path: Path, hidden: tuple[int, ...] = HIDDEN, seed: int 
     graph = helper.make_graph(
         nodes,
         "policy",
-        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["batch", OBS_SIZE])],
+        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["batch", sizes[0]])],
         [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["batch", 12])],
         weights,
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    fields = {**contract(), "mode": "handstand", "default_pose": HANDSTAND.pose.tolist(), "action_scale": 0.5}
+    about = {"mode": mode, "default_pose": HOLDS[mode].pose.tolist(), "command": list(command)}
+    fields = {**contract(), **about, "action_scale": 0.5}
     for key, value in fields.items():
         model.metadata_props.add(key=key, value=json.dumps(value))
     onnx.save(model, str(path))

@@ -32,8 +32,10 @@ from tools.table2_study import (  # noqa: E402
     Table2Cfg,
     jobs,
     keep,
+    orders,
     sequences,
     switches,
+    told,
     tune,
     work,
 )
@@ -50,9 +52,14 @@ def tuned(cfg: Table2Cfg, path: Path, console: Console) -> dict[str, Rule]:
         kept = json.loads(path.read_text(encoding="utf-8"))
         return {name: Rule(**values) for name, values in kept.items()}
     found = {"untuned": Rule(0, cfg.untuned)}
-    for name, rules in (("sequence", sequences(cfg)), ("pitch", switches(cfg))):
+    grids = (
+        ("sequence", sequences(cfg), None),
+        ("pitch", switches(cfg), None),
+        ("ppo", orders(cfg), told(cfg)),
+    )
+    for name, rules, modes in grids:
         with console.status(f"tuning: {CONTROLLERS[name]}, {len(rules)} rules"):
-            found[name], cost = tune(cfg, rules)
+            found[name], cost = tune(cfg, rules, modes)
         console.print(f"{CONTROLLERS[name]}: {found[name]}, mean cost {cost:.2f}", highlight=False)
     study.write_json(path, {name: asdict(rule) for name, rule in found.items()})
     return found
@@ -110,6 +117,7 @@ def main(args: Args) -> int:
     with one_line_errors():
         cfg = study_cfg(ROOT / "cfg" / "table2.toml", Table2Cfg, args.set)
         flip_task(cfg.flip.task)  # what is wrong with a policy file shows here
+        told(cfg)
         folder = study.folder_of(args.out, cfg)
     (folder / "runs").mkdir(exist_ok=True)
     rules = tuned(cfg, folder / "rules.json", console)

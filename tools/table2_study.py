@@ -15,13 +15,15 @@ from torch import Tensor
 
 from hmc import ModeSet, Task
 from hmc.go2.observe import pitch
-from hmc.go2.task import JumpCfg, flip_task, make_sim, sampling_mode, timeline
+from hmc.go2.policy import Policy
+from hmc.go2.task import JumpCfg, flip_task, make_sim, policy_path, sampling_mode, timeline
 from hmc.sampling import METHODS, SamplingCfg
 from hmc.start import make_start
 from hmc.worlds import Worlds, finite
 from tools.closed_loop import Controller, RunCfg, chosen, disturbed_start, planned, run
 
 CONTROLLERS = {
+    "ppo": "one policy, told to flip, tuned",
     "mppi": "MPPI only",
     "cem": "CEM only",
     "ps": "predictive sampling only",
@@ -48,6 +50,7 @@ class Table2Cfg:
         thresholds: of the pitch at which the hand mode takes over [deg], to choose from; -90: foot stand.
         untuned: duration of the jump in the sequence that nobody tuned; it begins at the command.
         sampling: of the controllers that sample inputs all the time.
+        unified: policy file of the controller without modes; empty for the one that comes with the package.
         flip: the task, the planner's search and the start: cfg/flip.toml.
     """
 
@@ -59,6 +62,7 @@ class Table2Cfg:
     thresholds: tuple[float, ...] = (-45.0, 0.0, 45.0)
     untuned: int = 20
     sampling: SamplingCfg = field(default_factory=SamplingCfg)
+    unified: str = ""
     flip: RunCfg = field(default_factory=RunCfg)
 
     def __post_init__(self) -> None:
@@ -75,6 +79,8 @@ class Table2Cfg:
 class Rule:
     """A sequence of modes that is fixed beforehand: foot, jump, hand.
 
+    Of the policy without modes, the first two are what it is told, foot stand and handstand.
+
     Attributes:
         early: control steps before the command at which the jump begins.
         duration: of the jump, at most [control steps].
@@ -84,6 +90,16 @@ class Rule:
     early: int
     duration: int = NEVER
     threshold: float = math.inf
+
+
+def told(cfg: Table2Cfg) -> ModeSet:
+    """The policy without modes, told to hold the foot stand, and told to be in the handstand."""
+    path = policy_path("unified", cfg.unified)
+
+    def policy(name: str, wanted: float) -> Policy:
+        return Policy(path, name=name, command=lambda x, k: x.new_full((len(x), 1), wanted))
+
+    return ModeSet([policy("told foot", -1.0), policy("told hand", 1.0)])
 
 
 class Sequencer:
@@ -129,12 +145,19 @@ def executed_costs(task: Task, cfg: RunCfg, rules: Sequence[Rule], seed: int) ->
     return cost
 
 
-def tune(cfg: Table2Cfg, rules: Sequence[Rule]) -> tuple[Rule, float]:
-    """The rule with the lowest mean cost over the tuning seeds, and that cost."""
-    costs = [
-        executed_costs(flip_task(cfg.flip.task, seed=seed), cfg.flip, rules, seed)
-        for seed in cfg.tuning_seeds
-    ]
+def tune(cfg: Table2Cfg, rules: Sequence[Rule], modes: ModeSet | None = None) -> tuple[Rule, float]:
+    """The rule with the lowest mean cost over the tuning seeds, and that cost.
+
+    Args:
+        cfg: of the study.
+        rules: to choose from.
+        modes: that they switch between; default: the flip's.
+    """
+    costs = []
+    for seed in cfg.tuning_seeds:
+        task = flip_task(cfg.flip.task, seed=seed)
+        task = task if modes is None else replace(task, modes=modes, rules=None)
+        costs.append(executed_costs(task, cfg.flip, rules, seed))
     mean = torch.stack(costs).mean(0)
     best = int(mean.argmin())
     return rules[best], float(mean[best])
@@ -143,6 +166,11 @@ def tune(cfg: Table2Cfg, rules: Sequence[Rule]) -> tuple[Rule, float]:
 def sequences(cfg: Table2Cfg) -> list[Rule]:
     """The grid of fixed sequences."""
     return [Rule(early, duration) for early, duration in product(cfg.early, cfg.durations)]
+
+
+def orders(cfg: Table2Cfg) -> list[Rule]:
+    """When to tell the policy without modes to flip."""
+    return [Rule(early) for early in cfg.early]
 
 
 def switches(cfg: Table2Cfg) -> list[Rule]:
@@ -191,6 +219,8 @@ def controller(cfg: Table2Cfg, rules: dict[str, Rule], job: Job) -> tuple[Contro
             job.controller, settings, lambda n: make_sim(n, threads=1), timeline(flip.command), job.seed
         )
         return chosen(ModeSet([mode]), lambda x, k: job.controller), task
+    if job.controller == "ppo":
+        task = replace(task, modes=told(cfg), rules=None)
     follow = Sequencer([rules[job.controller]], flip.command)
     return chosen(task.modes, lambda x, k: task.modes.names[int(follow(x[None], k))]), task
 

@@ -185,6 +185,8 @@ class Args:
 def set_up(args: Args) -> tuple[Policy, Starts | LegsStarts]:
     """The policy and the states it begins from."""
     network = Network(args.policy)
+    if network.mode == "unified":
+        raise ValueError(f"{args.policy} is of unified, which has no modes: tools/table2.py measures it")
     if (args.starts == "walk") != bool(network.command):
         raise ValueError(f"{args.policy} is of {network.mode}: --starts walk is for walk, and for it alone")
     if network.mode in STANCES:

@@ -30,6 +30,7 @@ from hmc.go2.stances import HOLDS  # noqa: E402
 from hmc.go2.value import VALUE_EXTRA, Value  # noqa: E402
 from train.config import config_hash, portable  # noqa: E402
 from train.runner import read_checkpoint  # noqa: E402
+from train.unified import TOWARDS  # noqa: E402
 
 
 def actor_of(checkpoint: dict[str, Any]) -> MLPModel:
@@ -63,14 +64,22 @@ def _network(state: dict[str, Tensor], sees: str, outputs: int, **settings: Any)
 
 
 class _Deterministic(nn.Module):
-    """The mean action, or the value, of an observation batch."""
+    """The mean action, or the value, of an observation batch.
 
-    def __init__(self, network: MLPModel):
+    Args:
+        network: the actor or the critic.
+        shift: what the command adds to an action, (c, 12); None for nothing.
+    """
+
+    def __init__(self, network: MLPModel, shift: Tensor | None = None):
         super().__init__()
         self.net = network.as_onnx(verbose=False).eval()
+        self.shift: Tensor | None
+        self.register_buffer("shift", shift)
 
     def forward(self, obs: Tensor) -> Tensor:
-        return self.net(obs)
+        output = self.net(obs)
+        return output if self.shift is None else output + obs[:, OBS_SIZE:] @ self.shift
 
 
 def export(checkpoint: Path, out: Path, *, value: bool = False) -> None:
@@ -80,7 +89,8 @@ def export(checkpoint: Path, out: Path, *, value: bool = False) -> None:
     config = portable(json.loads(meta["config"]))
     mode = config["env"]["mode"]
     command = COMMANDS.get(mode, ())
-    module = _Deterministic(critic_of(data) if value else actor_of(data)).eval()
+    shift = TOWARDS[None] / config["env"]["action_scale"] if mode == "unified" and not value else None
+    module = _Deterministic(critic_of(data) if value else actor_of(data), shift).eval()
     size = OBS_SIZE + len(command) + (VALUE_EXTRA if value else 0)
     partial = out.with_suffix(".partial.onnx")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision

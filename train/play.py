@@ -7,15 +7,16 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from hmc.go2.facts import COMMANDS
 from hmc.go2.model import load_model
 from hmc.go2.policy import Policy
-from hmc.go2.stances import HOLDS, STANCES
+from hmc.go2.stances import FOOTSTAND, HANDSTAND, HOLDS, STANCES
 from hmc.sim.mujoco import MujocoSim
 from train.evaluate import on_its_legs
 from train.export import export
@@ -24,6 +25,7 @@ from train.runner import read_checkpoint
 from train.starts import Starts, StartsCfg
 
 WALK = (0.6, 0.0, 0.0)  # what a walk is recorded at: forward, sideways [m/s], turn [rad/s]
+TOLD = 100  # control step at which the policy without modes is told to flip
 RENDER = Path(__file__).resolve().parents[1] / "tools" / "render.py"
 
 
@@ -44,10 +46,9 @@ def play(
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder:
         export(checkpoint, Path(folder) / "policy.onnx")
-        told = (lambda x, k: x.new_tensor(WALK).expand(len(x), 3)) if mode in COMMANDS else None
-        policy = Policy(Path(folder) / "policy.onnx", command=told)
-    good = on_its_legs if told else HOLDS[mode].held
-    start = _starts(mode, cfg["starts"]).sample(1)
+        policy = Policy(Path(folder) / "policy.onnx", command=COMMAND.get(mode))
+    good = on_its_legs if mode == "walk" else HANDSTAND.held if mode == "unified" else HOLDS[mode].held
+    start = _starts(mode, cfg.get("starts", {})).sample(1)
     sim = MujocoSim(load_model(), 1, threads=threads)
     sim.reset(start.x, start.u)
     k = torch.zeros(1, dtype=torch.long)
@@ -70,8 +71,16 @@ def play(
     return f"{line}\n{(drawn.stdout or drawn.stderr).strip()}"
 
 
+COMMAND: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "walk": lambda x, k: x.new_tensor(WALK).expand(len(x), 3),
+    "unified": lambda x, k: torch.where(k < TOLD, -1.0, 1.0)[:, None].to(x),
+}
+
+
 def _starts(mode: str, cfg: dict[str, Any]) -> Starts | LegsStarts:
     """Where episodes began in training."""
+    if mode == "unified":
+        return Starts(FOOTSTAND, StartsCfg(stance=1.0, home=0.0), torch.device("cpu"))
     if mode in STANCES:
         cfg = {**cfg, "recorded": 0.0, "records": ""}
         return Starts(STANCES[mode], StartsCfg(**cfg), torch.device("cpu"), unlocked=True)

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from hmc.go2.stances import FOOTSTAND, HANDSTAND, STAND
+from hmc.go2.stances import BETWEEN, FOOTSTAND, HANDSTAND
 from hmc.sim.base import Sim
 from train.env import EnvCfg, Gap, Go2Env, Start
 from train.rewards import RewardCfg, stage_rewards
@@ -18,6 +18,8 @@ from train.starts import KINDS, STANCE, Starts, StartsCfg
 GOALS = (FOOTSTAND, HANDSTAND)  # command -1 and +1
 FLIP = len(GOALS) * len(KINDS)  # kind of start: the foot stand, which is told to flip
 MIRROR = (1.0,)  # of the command
+# joint targets are about the pose of the stance that is asked for: half way between both and command x this
+TOWARDS = (HANDSTAND.pose - FOOTSTAND.pose) / 2
 
 
 @dataclass(frozen=True)
@@ -123,13 +125,17 @@ class UnifiedEnv(Go2Env):
     def __init__(self, cfg: UnifiedCfg, sim: Sim, zeros: Tensor | None = None):
         self._told = torch.zeros(sim.num_worlds, dtype=torch.long, device=sim.device)  # step of the command
         super().__init__(
-            cfg, sim, STAND, UnifiedStarts(cfg, sim.device), cfg.rewards.termination, zeros, MIRROR
+            cfg, sim, BETWEEN, UnifiedStarts(cfg, sim.device), cfg.rewards.termination, zeros, MIRROR
         )
 
     @property
     def _hand(self) -> Tensor:
         """Worlds in which the handstand is asked for, (n,) bool."""
         return self.command[:, 0] > 0
+
+    def targets(self, actions: Tensor) -> Tensor:
+        shift = TOWARDS.to(actions) * self.command / self.cfg.action_scale
+        return super().targets(actions + shift)
 
     def rewards(self, x: Tensor, before: Tensor, u: Tensor, u_prev: Tensor, gap: Gap) -> dict[str, Tensor]:
         foot, hand = (

@@ -105,5 +105,11 @@ HANDSTAND = Stance("handstand", +1, go2.HANDSTAND, go2.FRONT, go2.REAR)
 FOOTSTAND = Stance("footstand", -1, go2.FOOTSTAND, go2.REAR, go2.FRONT)
 STANCES = {stance.name: stance for stance in (HANDSTAND, FOOTSTAND)}
 STAND = Stand(go2.HOME)
+# half way between the poses of the stances, which no robot stands in
+BETWEEN = Stand((go2.FOOTSTAND + go2.HANDSTAND) / 2)
 # what the learned modes hold, or return to
-HOLDS: dict[str, Stance | Stand] = {**STANCES, **dict.fromkeys(("stand", "getup", "walk", "unified"), STAND)}
+HOLDS: dict[str, Stance | Stand] = {
+    **STANCES,
+    **dict.fromkeys(("stand", "getup", "walk"), STAND),
+    "unified": BETWEEN,
+}

@@ -1,0 +1,150 @@
+"""The policy without modes: what it is asked for, when it is told to flip, and how it is judged."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from hmc.go2 import model as go2
+from hmc.go2.facts import OBS_SIZE
+from hmc.go2.network import Network
+from hmc.go2.observe import pitch
+from hmc.go2.stances import FOOTSTAND, HANDSTAND
+from tests.tiny import STARTS, make_runner
+from train import evaluate, make, play
+from train.config import PpoCfg, UnifiedTraining
+from train.export import actor_of, export
+from train.rewards import stage_rewards
+from train.runner import read_checkpoint
+from train.starts import KINDS, RECORDED, STANCE, WAY, StartsCfg
+from train.unified import FLIP, UnifiedCfg, UnifiedEnv, UnifiedStarts
+
+CPU = torch.device("cpu")
+STANCES = StartsCfg(stance=1.0, home=0.0)
+HAND = len(KINDS)  # the first kind of start of the handstand
+CFG = UnifiedCfg("unified", worlds=8, footstand=STANCES, handstand=STANCES, told=(0.2, 0.2))
+
+
+def make_env(cfg: UnifiedCfg = CFG) -> UnifiedEnv:
+    env = make.make_env(cfg, "mujoco", threads=1)
+    assert isinstance(env, UnifiedEnv)
+    return env
+
+
+def opened(starts: UnifiedStarts) -> UnifiedStarts:
+    """The same, its handstand reached from everywhere."""
+    starts.stances[1].success[:] = 1.0
+    return starts
+
+
+def test_what_is_asked_for_is_where_it_begins_or_the_other_one():
+    torch.manual_seed(0)
+    env = make_env(UnifiedCfg("unified", worlds=64, footstand=STANCES, handstand=STANCES))
+    foot = env._kind == STANCE
+    assert torch.equal(env.command[:, 0], torch.where(foot, -1.0, 1.0))
+    assert torch.equal(pitch(env._x) > 0, ~foot)
+    assert 5 < foot.sum() < 59
+    for group in env.get_observations().values():
+        assert torch.equal(group[:, OBS_SIZE], env.command[:, 0])
+
+
+def test_nobody_flips_before_the_way_is_open():
+    torch.manual_seed(1)
+    starts = UnifiedStarts(CFG, CPU)
+    assert not (starts.draw(256).kind == FLIP).any()
+    start = opened(starts).draw(2000)
+    flips = start.kind == FLIP
+    assert float(flips.float().mean()) == pytest.approx(CFG.shares[2], abs=0.04)
+    assert (pitch(start.x[flips]) < -1).all()
+    assert (pitch(start.x[start.kind == HAND + STANCE]) > 1).all()
+    assert float(starts.shares.sum()) == pytest.approx(1.0)
+    assert len(starts.shares) == len(starts.rates) == len(starts.kinds) == FLIP + 1
+
+
+def test_each_stance_learns_from_its_own_episodes():
+    cfg = UnifiedCfg("unified", footstand=STARTS, handstand=STARTS)
+    starts = UnifiedStarts(cfg, CPU)
+    kinds = torch.tensor([WAY, HAND + WAY, HAND + STANCE, FLIP])
+    starts.report(kinds, torch.tensor([3, 5, 0, 0]), torch.tensor([True, False, True, True]))
+    foot, hand = starts.stances
+    assert foot.success.flatten()[3] == pytest.approx(0.05)
+    assert not hand.success.any()
+    moved = {kind: float(starts.rates[kind]) for kind in kinds.tolist()}
+    once = pytest.approx(0.005, rel=1e-3)
+    assert moved == {WAY: once, HAND + WAY: 0.0, HAND + STANCE: once, FLIP: once}
+    again = UnifiedStarts(cfg, CPU)
+    again.load_state_dict(starts.state_dict())
+    assert torch.equal(again.rates, starts.rates)
+    assert torch.equal(again.stances[0].success, foot.success)
+
+
+def test_rewards_are_those_of_the_stance_that_is_asked_for():
+    env = make_env()
+    x = torch.stack([HANDSTAND.state()] * 4 + [FOOTSTAND.state()] * 4).float()
+    env.command = torch.tensor([[1.0], [-1.0]] * 4)
+    u = x[:, 7:19]
+    gap = go2.clearances(x)
+    found = env.rewards(x, x, u, u, gap)
+    for world, goal in enumerate((HANDSTAND, FOOTSTAND) * 4):
+        expected = stage_rewards(env.cfg.rewards, goal, x, x, u, u, env._anchor, env.sim.dt, gap)
+        for name, term in found.items():
+            assert term[world] == expected[name][world], name
+    held = [True, False, True, False, False, True, False, True]
+    env.command = torch.tensor([[1.0], [-1.0]] * 4)
+    assert env.good(x, gap).tolist() == held
+
+
+def test_a_flip_is_told_once_and_has_its_own_grace_time():
+    env = make_env()
+    env._kind[:], env._kind[4:] = FLIP, STANCE
+    env.command[:], env._told[:] = -1.0, 10
+    x = FOOTSTAND.state().float().repeat(8, 1)
+    low = x.clone()
+    low[:, 2] -= 0.2
+    gap = {name: each.abs() + 0.1 for name, each in go2.clearances(x).items()}
+    flips = [True] * 4 + [False] * 4
+    for step in range(1, 120):
+        env.episode_length_buf[:] = step
+        env.rewards(x, x, x[:, 7:19], x[:, 7:19], gap)
+        told = step >= 10
+        assert env.command[:, 0].tolist() == [1.0 if told and flip else -1.0 for flip in flips]
+        late = (step - 10) * env.sim.dt > env.cfg.grace
+        assert env.fallen(x, gap).tolist() == [told and late and flip for flip in flips], step
+        # one that began in the stance that it is to hold falls at once
+        assert env.fallen(low, gap).tolist() == [not told or late or not flip for flip in flips]
+
+
+def test_it_is_trained_exported_and_played(tmp_path):
+    cfg = UnifiedTraining(CFG, PpoCfg(hidden=(16, 8), steps=6, epochs=1, minibatches=2, mirror=0.5))
+    runner = make_runner(tmp_path, cfg)
+    before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
+    runner.learn(2)
+    assert any(not torch.equal(*pair) for pair in zip(before, runner.alg.actor.parameters(), strict=True))
+    checkpoint = tmp_path / "model_0.pt"
+    runner.save(str(checkpoint))
+    export(checkpoint, tmp_path / "unified.onnx")
+    env = runner.env
+    obs = env.get_observations()["policy"]
+    with torch.no_grad():
+        expected = env.targets(actor_of(read_checkpoint(checkpoint))(TensorDict({"policy": obs}, [len(obs)])))
+    network = Network(tmp_path / "unified.onnx")
+    output = torch.from_numpy(network.run(obs.numpy()))
+    found = (torch.from_numpy(network.pose) + network.scale * output).clamp(go2.Q_LOWER, go2.Q_UPPER)
+    torch.testing.assert_close(found.float(), expected, atol=1e-5, rtol=0)
+    line = play.play(checkpoint, "unified", tmp_path, seconds=0.3, threads=1)
+    assert line.startswith("unified: held for")
+    with pytest.raises(ValueError, match=r"unified\.onnx is of unified, which .* tools/table2\.py"):
+        evaluate.set_up(evaluate.Args(tmp_path / "unified.onnx"))
+
+
+def test_targets_are_about_the_pose_of_the_stance_that_is_asked_for():
+    env = make_env()
+    env.command = torch.tensor([[1.0], [-1.0]] * 4)
+    for world, target in enumerate(env.targets(torch.zeros(8, 12))):
+        torch.testing.assert_close(target, (FOOTSTAND if world % 2 else HANDSTAND).pose.float())
+
+
+def test_kinds_have_names():
+    assert UnifiedStarts.kinds[HAND + RECORDED] == "handstand_recorded"
+    assert UnifiedStarts.kinds[FLIP] == "flip"
