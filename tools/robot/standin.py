@@ -208,9 +208,10 @@ class StandIn:
             return "head"
         if self._strict and command.level_flag != LOW_LEVEL:
             return "level flag"
-        if not np.isin(command.motors.mode, (FOC, STOP)).all():
+        mode = command.motors.mode
+        if not ((mode == FOC) | (mode == STOP)).all():
             return "motor mode"
-        if not all(np.isfinite(values).all() for values in command.motors[:5]):
+        if not np.isfinite(np.concatenate(command.motors[:5])).all():
             return "not a number"
         return None if self.released else "not released"
 
