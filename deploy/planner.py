@@ -37,6 +37,8 @@ class PlannerCfg:
     Attributes:
         lead: control steps from a plan's begin until the handstand is wanted, while the first way to it is
             looked for.
+        rest: horizon of plans in which no flip is looked for, in control steps: before the handstand is asked
+            for, and once the robot is in it.
         first: effort of a plan then: the robot stands and can wait.
         search: effort of every other plan.
         mpc: whether the jump is planned by sampling MPC inside the plans; else its guess is played as it is.
@@ -49,6 +51,7 @@ class PlannerCfg:
     """
 
     lead: int = 45
+    rest: int = 40
     mpc: bool = False
     others: EnsembleCfg = field(default_factory=EnsembleCfg)
     landed: float = 0.8
@@ -81,7 +84,7 @@ class Planner:
     stands, and the search goes on.
 
     Attributes:
-        task: what is planned.
+        task: what is planned while a flip is looked for.
         seconds: that the last plans took [s].
 
     Args:
@@ -105,14 +108,15 @@ class Planner:
     ):
         task = replace(task, jump=replace(task.jump, mpc=cfg.mpc))
         self._horizon, self._tick = task.horizon, DT / speed
-        if not cfg.lead < self._horizon <= STEPS:
+        if not max(cfg.lead, cfg.rest - 1) < self._horizon <= STEPS:
             raise ValueError(
-                f"horizon must be more than the lead of {cfg.lead} control steps and at most {STEPS}, "
-                f"got {self._horizon}"
+                f"horizon must be more than the lead of {cfg.lead} control steps, at least the {cfg.rest} of "
+                f"a plan at rest, and at most {STEPS}, got {self._horizon}"
             )
         # in the task's own time, later than the end of a horizon that begins at 0
         self._wanted = self._horizon + 1
         self.task: Task = flip_task(replace(task, command=self._wanted), seed=seed, threads=threads)
+        self._calm = replace(self.task, horizon=cfg.rest)
         if self.task.modes.names != NAMES:
             raise ValueError(f"modes must be {', '.join(NAMES)}, got {', '.join(self.task.modes.names)}")
         self.seconds: deque[float] = deque([0.1] * 5, maxlen=30)
@@ -170,7 +174,7 @@ class Planner:
             return None
         searching = int(state["asked"]) >= 0 and start.mode == FOOT and self._command is None
         if int(state["asked"]) < 0:
-            return self._ship(state, begin, start, self._follow(start, [FOOT] * self._horizon))
+            return self._ship(state, begin, start, self._follow(self._calm, start, [FOOT] * self._cfg.rest))
         if searching:
             start = replace(start, k=self._wanted - self._cfg.lead)
             effort, modes = self._cfg.search if self._known else self._cfg.first, self._guess
@@ -178,10 +182,11 @@ class Planner:
             command = begin if self._command is None else self._command
             start = replace(start, k=max(0, begin - command + self._wanted))
             effort = self._cfg.search
+        task = self._calm if start.mode == HAND else self.task
         found = plan(
-            self.task,
+            task,
             start,
-            schedule=modes,
+            schedule=modes[: task.horizon],
             seed=(self._seed, begin),
             sim=self._sim,
             forget=False,
@@ -189,7 +194,7 @@ class Planner:
         )
         trace = found.known
         if trace.schedule != found.schedule:
-            trace = self._follow(start, found.schedule.modes, trace)
+            trace = self._follow(task, start, found.schedule.modes, trace)
         reached = self._reached(trace)
         if start.mode != FOOT:
             return self._ship(state, begin, start, trace)
@@ -200,7 +205,7 @@ class Planner:
             self._command = begin + self._cfg.lead
         elif not reached:
             self._command, self._known, self._guess = None, False, list(found.schedule)
-            trace = self._follow(start, [FOOT] * self._horizon)
+            trace = self._follow(self.task, start, [FOOT] * self._horizon)
         return self._ship(state, begin, start, trace)
 
     def landed(self, start: Start, modes: Sequence[int]) -> float:
@@ -220,14 +225,14 @@ class Planner:
             self._known, self._guess, self._refused = False, [FOOT] * self._horizon, 0
         return agreed
 
-    def _follow(self, start: Start, modes: Sequence[int], known: Trace | None = None) -> Trace:
+    def _follow(self, task: Task, start: Start, modes: Sequence[int], known: Trace | None = None) -> Trace:
         """What a schedule leads to."""
-        evaluator = Evaluator(self.task, self._sim, start, known)
+        evaluator = Evaluator(task, self._sim, start, known)
         return evaluator.trace(Schedule(tuple(modes), NAMES))
 
     def _ship(self, state: np.ndarray, begin: int, start: Start, trace: Trace) -> np.ndarray | None:
-        """The value of the plan's slot for a schedule and what it leads to."""
-        if len(trace) < self._horizon:
+        """The value of the plan's slot for a schedule and what it leads to; None if it does not go on."""
+        if len(trace) < trace.task.horizon:
             return None
         self._number += 1
         self._shipped[self._number] = Shipped(begin, trace)

@@ -142,7 +142,23 @@ def test_a_flip_is_left_alone_until_the_handstand_and_given_up_if_it_is_not_take
 def test_before_it_is_asked_for_the_foot_stand_goes_on() -> None:
     record = planner(5).plan(situation(asked=-1), 5)
     assert record is not None
-    assert set(record["modes"][: record["steps"]].tolist()) == {FOOT}
+    assert record["modes"][: record["steps"]].tolist() == [FOOT] * 40
+
+
+def test_in_the_handstand_plans_are_short() -> None:
+    it = planner(5, 0, "rest=30")
+    x = HANDSTAND.state().numpy()
+    record = it.plan(situation(x=x, u=x[7:19], mode=HAND), 5)
+    assert record is not None
+    assert record["modes"][: record["steps"]].tolist() == [HAND] * 30
+
+
+@pytest.mark.parametrize("wrong", ["lead=75", "rest=76"])
+def test_plans_that_do_not_fit_into_the_horizon(wrong: str) -> None:
+    with pytest.raises(
+        ValueError, match=r"horizon must be more than the lead of \d+ control steps, at least"
+    ):
+        planner(5, 0, wrong)
 
 
 def test_a_flip_that_others_do_not_land_is_not_sent() -> None:
