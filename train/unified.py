@@ -28,8 +28,8 @@ class UnifiedCfg(EnvCfg):
 
     Attributes:
         mode: unified.
-        shares: of episodes in which the foot stand is asked for, the handstand, and first one, then the
-            other.
+        shares: of worlds in which the foot stand is asked for, the handstand, and first one, then the
+            other. Of worlds, not of episodes: what falls soon would be in few of the steps to learn from.
         told: seconds, uniform, after which the latter are told to flip.
         grace: seconds before height and tilt end an episode that did not begin in the stance asked for, or
             since it was told to flip.
@@ -41,7 +41,7 @@ class UnifiedCfg(EnvCfg):
     """
 
     mode: Literal["unified"]
-    shares: tuple[float, float, float] = (0.3, 0.4, 0.3)
+    shares: tuple[float, float, float] = (0.4, 0.3, 0.3)
     told: tuple[float, float] = (0.2, 2.0)
     grace: float = 1.5
     min_height: float = 0.44
@@ -52,13 +52,18 @@ class UnifiedCfg(EnvCfg):
 
 
 class UnifiedStarts:
-    """Draws start states of both stances; each has its own curriculum."""
+    """Draws start states of both stances; each has its own curriculum.
+
+    Attributes:
+        goals: what is asked for in the worlds that are drawn for next, (n,): index of GOALS, or 2 to flip.
+    """
 
     kinds = (*(f"{goal.name}_{kind}" for goal in GOALS for kind in KINDS), "flip")
 
     def __init__(self, cfg: UnifiedCfg, device: torch.device):
         self.device = device
-        self._goals = torch.tensor(cfg.shares, device=device)
+        self.goals = torch.zeros(0, dtype=torch.long, device=device)
+        self._shares = torch.tensor(cfg.shares, device=device)
         self.stances = [Starts(FOOTSTAND, cfg.footstand, device), Starts(HANDSTAND, cfg.handstand, device)]
         upright = StartsCfg(stance=1.0, home=0.0)
         self._flip = Starts(FOOTSTAND, upright, device)
@@ -72,14 +77,14 @@ class UnifiedStarts:
     @property
     def shares(self) -> Tensor:
         """Of each kind, (kinds,)."""
-        each = [goal * starts.shares for goal, starts in zip(self._goals, self.stances, strict=False)]
-        return torch.cat([*each, self._goals[2:]])
+        each = [goal * starts.shares for goal, starts in zip(self._shares, self.stances, strict=False)]
+        return torch.cat([*each, self._shares[2:]])
 
     def draw(self, n: int) -> Start:
-        """The next n starts."""
+        """The next n starts, one for each of `goals`."""
         # nobody flips who cannot rise into the handstand
         ready = self.stances[1].frontier() <= Starts.HORIZONTAL
-        goal = torch.multinomial(self._goals[: 3 if ready else 2], n, replacement=True)
+        goal = self.goals if ready else self.goals.clamp(max=1)
         drawn = [source.draw(n) for source in self._sources]
         x, u, kind, cell = (
             torch.stack(parts)[goal, torch.arange(n, device=self.device)]
@@ -121,9 +126,12 @@ class UnifiedEnv(Go2Env):
     """
 
     cfg: UnifiedCfg
+    starts: UnifiedStarts
 
     def __init__(self, cfg: UnifiedCfg, sim: Sim, zeros: Tensor | None = None):
         self._told = torch.zeros(sim.num_worlds, dtype=torch.long, device=sim.device)  # step of the command
+        edges = torch.tensor(cfg.shares, device=sim.device).cumsum(0)[:2] * sim.num_worlds
+        self._goals = torch.bucketize(torch.arange(sim.num_worlds, device=sim.device) + 0.5, edges)
         super().__init__(
             cfg, sim, BETWEEN, UnifiedStarts(cfg, sim.device), cfg.rewards.termination, zeros, MIRROR
         )
@@ -160,6 +168,7 @@ class UnifiedEnv(Go2Env):
         return torch.where(self._hand, HANDSTAND.held(x, gap), FOOTSTAND.held(x, gap))
 
     def _reset(self, ids: Tensor) -> None:
+        self.starts.goals = self._goals[ids]
         super()._reset(ids)
         first, last = (seconds / self.sim.dt for seconds in self.cfg.told)
         self._told[ids] = (first + (last - first) * torch.rand(len(ids), device=self.device)).long()
