@@ -253,6 +253,7 @@ def test_pictures_of_a_strip():
     assert len(strip_steps(flip, 9)) == 9
     assert max(strip_steps(flip[:45], 9)) == 44
     assert strip_steps(["handstand"] * 101, 5) == [0, 25, 50, 75, 100]
+    assert strip_steps(["getup"] * 50 + ["foot"] * 51, 5) == [0, 25, 50, 75, 100]
 
 
 def test_torchrun_without_a_gpu(capsys, monkeypatch):

@@ -90,11 +90,11 @@ def draw(args: Args) -> None:
 
 
 def strip_steps(modes: list[str], frames: int) -> list[int]:
-    """Pictures to show: evenly from just before the first jump on, or over all of a run without one."""
-    if len(set(modes)) == 1:
+    """Pictures to show: evenly over the run, or if it begins in the foot stand, over the flip."""
+    if modes[0] != "foot" or len(set(modes)) == 1:
         return sorted({round((len(modes) - 1) * i / (frames - 1)) for i in range(frames)})
-    jumps = [step for step, mode in enumerate(modes) if mode != "foot"]
-    first = max(jumps[0] - 6 // EVERY, 0) if jumps else 0
+    jump = next(step for step, mode in enumerate(modes) if mode != "foot")
+    first = max(jump - 6 // EVERY, 0)
     last = min(first + 64 // EVERY, len(modes) - 1)
     return sorted({round(first + (last - first) * i / (frames - 1)) for i in range(frames)})
 

@@ -35,6 +35,7 @@ from tools.study import Workers, run_all, write_json  # noqa: E402
 ARRIVED = 0.3  # m: so near to its place a robot is there
 HOLD = 0.5  # s that a goal is held without a break, to be reached; the last one, at the end of its time
 DOWN = 0.5  # s on the ground, where it should not be, and the course begins anew
+FRAMES = 14  # of the strip of a run
 SETTLE = 1.0  # s in which the robot that is laid on its side comes to rest
 
 
@@ -198,7 +199,7 @@ def write_reel(out: Path, done: Reel, cfg: ReelCfg, video: bool, console: Consol
         go2.DT,
         f"seed {done.seed}: {'all goals' if done.success else f'{done.furthest} goals'}, {done.tries} tries",
     )
-    if video and (reason := render.render_run(render.Args(log))):
+    if video and (reason := render.render_run(render.Args(log, frames=FRAMES))):
         console.print(reason)
 
 
