@@ -12,8 +12,27 @@ from hmc.go2.stances import Stance
 
 
 @dataclass(frozen=True)
-class RewardCfg:
-    """Weight of each term, a second of simulated time; the first three earn, the others cost.
+class EffortCfg:
+    """Weight of what moving costs in every mode, a second of simulated time.
+
+    Attributes:
+        limits: sum of joint positions beyond 95 % of their range [rad].
+        power: sum |torque x speed| [W].
+        acceleration: sum of squared joint accelerations [rad^2/s^4].
+        target_rate: sum of squared changes of the joint targets [rad^2].
+        termination: once, when an episode ends in a fall.
+    """
+
+    limits: float = 1.0
+    power: float = 0.001
+    acceleration: float = 2.5e-7
+    target_rate: float = 0.05
+    termination: float = 1.0
+
+
+@dataclass(frozen=True)
+class RewardCfg(EffortCfg):
+    """Weight of each term, those of `EffortCfg` too; the first three earn, the others cost.
 
     Height, orientation and the costs follow MuJoCo Playground's Go1 handstand task, with the contact
     term as intended there (the two free feet); stillness and free-leg posture are ours.
@@ -23,28 +42,19 @@ class RewardCfg:
         orientation: ((1 + cos tilt) / 2)^2.
         stillness: height x orientation x exp(-|v|^2 - 0.1 |omega|^2), v [m/s], omega [rad/s].
         contact: number of free feet on the ground.
-        limits: sum of joint positions beyond 95 % of their range [rad].
         posture: sum of squared deviations of the free legs from the stance's pose [rad^2].
         stance_posture: the same for the supporting legs.
-        power: sum |torque x speed| [W].
-        acceleration: sum of squared joint accelerations [rad^2/s^4].
-        target_rate: sum of squared changes of the joint targets [rad^2].
         drift: squared horizontal distance from the anchor [m^2].
-        termination: once, when an episode ends in a fall.
     """
 
     height: float = 1.0
     orientation: float = 1.0
     stillness: float = 0.5
     contact: float = 0.3
-    limits: float = 1.0
     posture: float = 0.1
     stance_posture: float = 0.05
     power: float = 0.0005
-    acceleration: float = 2.5e-7
-    target_rate: float = 0.05
     drift: float = 0.1
-    termination: float = 1.0
 
 
 TARGET_HEIGHT = 0.55  # m
@@ -95,7 +105,7 @@ def stage_rewards(
 
 
 def efforts(
-    cfg: RewardCfg | LegsRewardCfg,
+    cfg: EffortCfg,
     x: Tensor,
     before: Tensor,
     torque: Tensor,
@@ -114,8 +124,8 @@ def efforts(
 
 
 @dataclass(frozen=True)
-class LegsRewardCfg:
-    """Weight of each term on four legs, a second of simulated time; the first eight earn, the others cost.
+class LegsRewardCfg(EffortCfg):
+    """Weight of each term on four legs, those of `EffortCfg` too; the first eight earn, the others cost.
 
     With o = (1 + cos tilt) / 2 and h = exp(-max(0, 0.28 - z) / 0.1), z the base height [m]. Tracking is that
     of legged_gym (Rudin et al. 2021), as is rewarding feet for their time in the air; upright, height and
@@ -133,11 +143,6 @@ class LegsRewardCfg:
         trot: 1 while the robot is to move and exactly one pair of diagonal feet is on the ground.
         bounce: v_z^2 + 0.05 (omega_x^2 + omega_y^2).
         touch: number of thighs and shins on the ground, and of trunks.
-        limits: sum of joint positions beyond 95 % of their range [rad].
-        power: sum |torque x speed| [W].
-        acceleration: sum of squared joint accelerations [rad^2/s^4].
-        target_rate: sum of squared changes of the joint targets [rad^2].
-        termination: once, when an episode ends in a fall.
     """
 
     upright: float = 1.0
@@ -150,11 +155,6 @@ class LegsRewardCfg:
     trot: float = 0.0
     bounce: float = 0.0
     touch: float = 0.1
-    limits: float = 1.0
-    power: float = 0.001
-    acceleration: float = 2.5e-7
-    target_rate: float = 0.05
-    termination: float = 1.0
 
 
 def legs_rewards(
