@@ -18,7 +18,7 @@ from train.export import actor_of, export
 from train.rewards import stage_rewards
 from train.runner import read_checkpoint
 from train.starts import KINDS, RECORDED, STANCE, WAY, StartsCfg
-from train.unified import FLIP, UnifiedCfg, UnifiedEnv, UnifiedStarts
+from train.unified import FLIP, GoalPpo, UnifiedCfg, UnifiedEnv, UnifiedStarts
 
 CPU = torch.device("cpu")
 STANCES = StartsCfg(stance=1.0, home=0.0)
@@ -116,8 +116,27 @@ def test_a_flip_is_told_once_and_has_its_own_grace_time():
         assert env.fallen(low, gap).tolist() == [not told or late or not flip for flip in flips]
 
 
+def test_advantages_of_each_goal_have_its_own_scale(tmp_path):
+    ppo = PpoCfg(hidden=(16, 8), steps=6, epochs=1, minibatches=2, algorithm="train.unified:GoalPpo")
+    runner = make_runner(tmp_path, UnifiedTraining(CFG, ppo))
+    storage = runner.alg.storage
+    assert isinstance(runner.alg, GoalPpo)
+    command = torch.tensor([1.0, -1.0] * 4).expand(6, 8)
+    storage.observations["policy"][..., OBS_SIZE] = command
+    storage.rewards[:] = torch.randn(6, 8, 1) * torch.where(command > 0, 50.0, 0.1)[..., None]
+    storage.dones[:], storage.values[:] = 0, 0.0
+    runner.alg.compute_returns(runner.env.get_observations())
+    for goal in (-1.0, 1.0):
+        own = storage.advantages[..., 0][command == goal]
+        assert float(own.mean()) == pytest.approx(0.0, abs=1e-5)
+        assert float(own.std()) == pytest.approx(1.0, abs=1e-4)
+        returns = storage.returns[..., 0][command == goal]
+        assert torch.equal(own.argsort(), returns.argsort()), "what is better stays better"
+
+
 def test_it_is_trained_exported_and_played(tmp_path):
-    cfg = UnifiedTraining(CFG, PpoCfg(hidden=(16, 8), steps=6, epochs=1, minibatches=2, mirror=0.5))
+    ppo = PpoCfg(hidden=(16, 8), steps=6, epochs=1, minibatches=2, mirror=0.5)
+    cfg = UnifiedTraining(CFG, ppo)
     runner = make_runner(tmp_path, cfg)
     before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
     runner.learn(2)

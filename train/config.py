@@ -41,6 +41,7 @@ class PpoCfg:
         mirror: weight of the mean squared difference between the action on the mirror image of what the robot
             sees and the mirror image of its action (Mittal et al. 2024); 0 for none.
         hidden: layer sizes of actor and critic.
+        algorithm: rsl-rl's PPO, or another class as module:class.
     """
 
     iterations: int = 1000
@@ -56,6 +57,7 @@ class PpoCfg:
     init_std: float = 0.35
     mirror: float = 0.0
     hidden: tuple[int, ...] = (256, 128, 64)
+    algorithm: str = "PPO"
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def rsl_config(cfg: PpoCfg) -> dict[str, Any]:
         actor={**network, "distribution_cfg": noise},
         critic=dict(network),
         algorithm=dict(
-            class_name="PPO",
+            class_name=cfg.algorithm,
             num_learning_epochs=cfg.epochs,
             num_mini_batches=cfg.minibatches,
             learning_rate=cfg.learning_rate,

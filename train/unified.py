@@ -6,8 +6,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
 from torch import Tensor
 
+from hmc.go2.facts import OBS_SIZE
 from hmc.go2.stances import BETWEEN, FOOTSTAND, HANDSTAND
 from hmc.sim.base import Sim
 from train.env import EnvCfg, Gap, Go2Env, Start
@@ -111,6 +114,23 @@ class UnifiedStarts:
         """Go on from a checkpoint."""
         for goal, source in enumerate(self._sources):
             source.load_state_dict({key: state[f"{goal}_{key}"] for key in source.state_dict()})
+
+
+class GoalPpo(PPO):
+    """PPO whose advantages are normalised for each goal by itself.
+
+    Where the episodes of a goal all end alike, its advantages are small beside those of one that is half
+    learned, and next to nothing would be learned for it.
+    """
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        super().compute_returns(obs)
+        advantages = self.storage.advantages
+        command = self.storage.observations["policy"][..., OBS_SIZE:]
+        for goal in command.unique():
+            mine = command == goal
+            own = advantages[mine]
+            advantages[mine] = (own - own.mean()) / (own.std() + 1e-8)
 
 
 class UnifiedEnv(Go2Env):
