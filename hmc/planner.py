@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hmc.budget import Budget, Meter
 from hmc.evaluate import Evaluator
+from hmc.memory import make_worlds
 from hmc.schedule import Schedule, Switch, SwitchSpace
 from hmc.sim.base import Sim
 from hmc.solvers import ORDERS, SOLVERS, Search, run
@@ -172,6 +173,7 @@ def plan(
     seed: int | Sequence[int] = 0,
     progress: Progress | None = None,
     sim: Sim | None = None,
+    room: float | None = None,
     forget: bool = True,
     known: Trace | None = None,
 ) -> Plan:
@@ -212,18 +214,22 @@ def plan(
         seed: of the draws.
         progress: called with the plan so far after every batch and accepted switch; False stops.
         sim: simulator to plan in, made with `task.make_sim`; made anew if left out.
+        room: bytes that the worlds made then may take, see `hmc.memory`; None for what a GPU has free, on a
+            CPU for any. What does not fit at once is rolled out in parts.
         forget: let modes drop what they kept from earlier searches. A receding loop keeps it: then what
             a budget of control steps reaches depends on the ticks before.
         known: `Plan.known` of an earlier plan of this task, cut to where this one begins (`Trace.since`): if
             it meets the state bit for bit, its steps are not rolled out again. The plan is the same.
 
     Raises:
+        ValueError: an argument that makes no sense, or not even one schedule fits into the memory.
         PlanInterrupted: on Ctrl-C; a KeyboardInterrupt that carries the best plan so far.
     """
     _known("solver", solver, SOLVERS)
     _known("order", order, ORDERS)
     _check(samples, max_samples, pairs, moves, iterations, tolerance)
-    sim = sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs + moves))
+    if sim is None:
+        sim = make_worlds(task, worlds_for(task, samples, max_samples, pairs + moves), room)
     if forget:
         for each in task.modes:
             each.forget()

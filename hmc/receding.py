@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hmc.budget import Budget
+from hmc.memory import make_worlds
 from hmc.planner import Plan, Progress, plan, worlds_for
 from hmc.running import Running
 from hmc.sim.base import Sim
@@ -86,6 +87,7 @@ class Receding:
         seed: of the draws; each tick draws from (seed, k).
         k: control step of the first tick.
         sim: simulator to plan in; made once if left out.
+        room: bytes that its worlds may then take, as in `plan`.
         solver, samples, max_samples, order, pairs, moves, iterations, budget, tolerance, progress: as in
             `plan`, for every tick.
     """
@@ -98,6 +100,7 @@ class Receding:
         seed: int = 0,
         k: int = 0,
         sim: Sim | None = None,
+        room: float | None = None,
         solver: str = "sample",
         samples: int = 64,
         max_samples: int = 0,
@@ -110,9 +113,8 @@ class Receding:
         progress: Progress | None = None,
     ):
         self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
-        self.sim = (
-            sim if sim is not None else task.make_sim(worlds_for(task, samples, max_samples, pairs + moves))
-        )
+        wanted = worlds_for(task, samples, max_samples, pairs + moves)
+        self.sim = sim if sim is not None else make_worlds(task, wanted, room)
         self.running = Running(task.modes)
         self._known: Trace | None = None
         self._plan = partial(

@@ -27,7 +27,8 @@ class Sim(Protocol):
 
     A simulator may have an attribute `cheap`, True where a control step of all worlds takes less time than to
     ask a cost what it cost: rollouts then ask for several steps at once, make some in vain, and keep the
-    worlds that go on side by side.
+    worlds that go on side by side. It may have an attribute `world_bytes`, what a world takes on its device:
+    a search has as many as fit there (`hmc.memory`).
 
     A world whose state stops being finite stays so, quietly, and never disturbs another one: the
     caller finds it by looking at x.

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 import warp as wp
 
+from hmc.sim.device import free_memory
+
 
 def graphs(device: torch.device) -> tuple[bool, bool]:
     """Whether steps can be captured as graphs on a device, and whether these can hold loops.
@@ -57,11 +59,6 @@ def check_memory(one: Any, worlds: int, device: torch.device) -> None:
             f"{worlds:,} worlds take at least {worlds * each / 2**30:.2f} GiB on {device}, where "
             f"{free / 2**30:.2f} GiB are free: take at most {int(free // each):,} worlds"
         )
-
-
-def free_memory(device: torch.device) -> float:
-    """Bytes that are free on a device; without end on a CPU, which says for itself when it has no more."""
-    return float("inf") if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
 
 
 def num_bytes(data: Any) -> int:

@@ -29,3 +29,8 @@ def devices() -> str:
     if torch.version.cuda is None:
         return "there is only cpu (this torch is built without CUDA)"
     return "there is only cpu (no GPU, or no NVIDIA driver)"
+
+
+def free_memory(device: torch.device) -> float:
+    """Bytes that are free on a device; without end on a CPU, which says for itself when it has no more."""
+    return float("inf") if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])

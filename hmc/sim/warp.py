@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from hmc.sim.check import check, check_latency
-from hmc.sim.cuda import check_memory, graphs
+from hmc.sim.cuda import check_memory, graphs, num_bytes
 from hmc.sim.device import find_device
 from hmc.sim.ids import Ids, count, fresh, where
 from hmc.sim.variety import own_values
@@ -143,6 +143,7 @@ class WarpSim:
         self._own = torch.cat([values.flatten(1).float() for values in columns], 1).to(self._device)
         self._arrivals = sorted({0, *late} - {substeps})  # physics steps that inputs come at
         self._spaces: dict[int, Workspace] = {}
+        self._each = 0  # bytes of the engine's arrays of a world
         first = self._space(num_worlds)
         self._slices = first.slices
         self._fresh = first.read()[0]
@@ -153,6 +154,11 @@ class WarpSim:
     @property
     def num_worlds(self) -> int:
         return self._num_worlds
+
+    @property
+    def world_bytes(self) -> int:
+        """What a world takes on the device when all workspaces are made."""
+        return 2 * self._each + sum(part[0].nbytes for part in (self._rows, self._own, self._force))
 
     @property
     def nx(self) -> int:
@@ -240,7 +246,9 @@ class WarpSim:
         if size not in self._spaces:
             with wp.ScopedDevice(self._on_warp):
                 room = {"nconmax": self.contacts, "njmax": self.constraints}
-                check_memory(mjw.make_data(self.model, nworld=1, **room), size, self._device)
+                one = mjw.make_data(self.model, nworld=1, **room)
+                self._each = num_bytes(one)
+                check_memory(one, size, self._device)
                 data = mjw.make_data(self.model, nworld=size, **room)
                 params = with_fields(self._params, self._varied, size)
             self._spaces[size] = Workspace(
