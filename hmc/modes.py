@@ -87,7 +87,7 @@ class Motion(Mode):
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         step = memory[:, 0].long().clamp(max=len(self.inputs) - 1)
-        return self.inputs.to(x)[step], memory + 1
+        return self.inputs.to(x, non_blocking=True)[step], memory + 1
 
 
 class ModeSet:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from hmc.branches import Branches, branches
+from hmc.sim.device import upload
 from hmc.sim.ids import Ids, blocks
 from hmc.trace import Floats, Recorder, Traces
 from hmc.worlds import Crew, Flags, Indices, Worlds, finite
@@ -136,6 +137,8 @@ class _Rollout:
         # what cannot end a branch on the way is looked at now and then only
         watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
         self.at_once = 1 if watchful else STEPS
+        # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost
+        self.later = far(self.sim.device) and not watchful and self.stages > 0
         self.constant = task.modes.constants is not None
         self.rows = CHEAP_ROWS if self.cheap else ROWS
 
@@ -151,7 +154,8 @@ class _Rollout:
         x, u_prev = sim.x(self._at), sim.u(self._at)
         if self.recorder is not None:
             self.recorder.arrive(self.worlds, i, self.ids, self.at, x, u_prev)
-        if not math.isfinite(float(x.sum())):  # a finite sum has finite parts
+        look = i == self.horizon or not self.later
+        if look and not math.isfinite(float(x.sum())):  # a finite sum has finite parts
             x, u_prev = self._price(k, x, u_prev)
             x, u_prev = self._drop(~self._all(_flags(finite(x))), x, u_prev)
         if i == self.horizon:
@@ -166,7 +170,7 @@ class _Rollout:
             self.crew = self.worlds.crew(self.at, modes, modes if self.constant else self._before(i))
         u = self.worlds.act(self.crew, x, u_prev, k)
         self.unpriced.append((self.ids, x, u, u_prev))
-        fine = self.crew.held is not None or math.isfinite(float(u.sum()))
+        fine = self.later or self.crew.held is not None or math.isfinite(float(u.sum()))
         if not fine or len(self.unpriced) >= min(self.at_once, self.rows // self.size // self.members):
             (u,) = self._price(k + 1, u, sane=None if fine else self._all(_flags(finite(u))))
         if self.size > 0:
@@ -217,7 +221,7 @@ class _Rollout:
         return self._sums[:, : self.size * self.members]
 
     def _device(self, indices: np.ndarray) -> Tensor:
-        return torch.from_numpy(indices).to(self.sim.device)
+        return upload(indices, self.sim.device)
 
     def _go_on(self, ids: np.ndarray | slice) -> None:
         """Only branches `ids` go on."""
@@ -317,8 +321,11 @@ class _Rollout:
         x, u, u_prev = (
             steps[0][1:] if len(steps) == 1 else map(torch.cat, zip(*[s[1:] for s in steps], strict=True))
         )
-        ks = torch.from_numpy(np.arange(first, k).repeat(widths)).to(x.device)
-        terms = self.task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64).cpu().numpy() * self.sim.dt
+        ks = upload(np.arange(first, k).repeat(widths), x.device)
+        found = self.task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64)
+        if self.later:
+            found = found.masked_fill(~(finite(x) & finite(u))[:, None], math.nan)
+        terms = found.cpu().numpy() * self.sim.dt
         for (ids, *_), stage in zip(steps, np.split(terms.T, np.cumsum(widths[:-1]), 1), strict=True):
             sums = self._sums[:, : stage.shape[1]]
             np.add(sums, stage, out=sums)
@@ -374,6 +381,11 @@ class _Rollout:
                 self.worlds.branch(chosen, self.at)
             rows = tuple(each.index_select(0, chosen) for each in rows)
         return rows
+
+
+def far(device: torch.device) -> bool:
+    """Whether to look at a number on a device is to wait for all that it was told to do before."""
+    return device.type != "cpu"
 
 
 def _flags(values: Tensor) -> Flags:

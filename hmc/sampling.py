@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hmc.cost import Cost, total
 from hmc.modes import Mode
 from hmc.sim.base import Sim, rollout
+from hmc.sim.device import upload
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,30 @@ class Solution:
     control_steps: int
 
 
+@dataclass(frozen=True, eq=False)
+class Constants:
+    """What plans are made with, on one device and in one type; see `SamplingMpc`.
+
+    Attributes:
+        lower, upper: bounds of the input (nu,).
+        spline: weights of the knots at each step (H, K).
+        basis: directions of the noise (d, nu).
+        later: weights of the knots at where they are when a plan is shifted (K, K).
+        inside: how many of them, the first ones, are then within the old plan.
+        at: control steps that the knots sit at (K,), float32.
+        guess: inputs (G, nu) of the guess, in its own type; None for none.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    spline: Tensor
+    basis: Tensor
+    later: Tensor
+    inside: int
+    at: Tensor
+    guess: Tensor | None
+
+
 class SamplingMpc(Mode):
     r"""Sampling MPC on spline knots, batched over worlds and deterministic.
 
@@ -138,6 +164,9 @@ class SamplingMpc(Mode):
     Between re-plans the plan runs open loop; a re-plan starts from the plan shifted by the steps taken.
     Memory: the knots, then the number of steps taken since entry. The last `MEMO` re-plans are kept:
     the same situation is never rolled out twice.
+
+    On a GPU a step waits for the device once, to learn in how many worlds it re-plans, and if there are any
+    once more, for their situations: what is known already is not rolled out. The re-plan itself does not wait.
 
     Args:
         name: of the mode.
@@ -176,10 +205,14 @@ class SamplingMpc(Mode):
         self._sim: Sim | None = None
         self.spline = _spline(cfg.horizon, cfg.knots)
         self._known: dict[bytes, Tensor] = {}
+        self._there: dict[tuple[torch.device, torch.dtype], Constants] = {}
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
         n = len(x)
-        theta = u[:, None].expand(n, self.cfg.knots, self.nu) if self.guess is None else self._prior(x, 0)
+        if self.guess is None:
+            theta = u[:, None].expand(n, self.cfg.knots, self.nu)
+        else:
+            theta = self._prior(x, x.new_zeros(1)).expand(n, -1, -1)
         return torch.cat([theta.reshape(n, -1).to(x), x.new_zeros(n, 1)], 1)
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
@@ -189,10 +222,10 @@ class SamplingMpc(Mode):
         phase = taken.long() % self.cfg.replan_every
         now = (phase == 0).nonzero().squeeze(1)
         if len(now):
-            shifted = self._shift(theta[now], x[now], taken[now])
+            shifted = self._shift(theta[now], taken[now])
             theta[now] = self._replan_known(x[now], u[now], shifted, k[now])
-        action = (self.spline.to(x)[phase][:, None] @ theta).squeeze(1)
-        action = action.clamp(self.lower.to(x), self.upper.to(x))
+        its = self._constants(x)
+        action = (its.spline[phase][:, None] @ theta).squeeze(1).clamp(its.lower, its.upper)
         return action, torch.cat([theta.reshape(n, -1), (taken + 1)[:, None]], 1)
 
     def forget(self) -> None:
@@ -208,7 +241,7 @@ class SamplingMpc(Mode):
             control_steps: budget; an update takes S H of them, and one at least is made.
             k: control step since the start of the task.
         """
-        step = torch.tensor([k], device=x.device)
+        step, its = torch.tensor([k]), self._constants(x)
         theta = self.reset(x[None], u[None], step)[:, :-1].reshape(1, self.cfg.knots, self.nu)
         std, best = None, (math.inf, theta[0])
         updates = max(1, control_steps // (self.cfg.samples * self.cfg.horizon))
@@ -217,35 +250,44 @@ class SamplingMpc(Mode):
             at = int(costs[0].argmin())
             if float(costs[0, at]) < best[0]:
                 best = float(costs[0, at]), plans[0, at]
-        controls = (self.spline.to(x) @ best[1]).clamp(self.lower.to(x), self.upper.to(x))
+        controls = (its.spline @ best[1]).clamp(its.lower, its.upper)
         return Solution(controls, best[0], updates * self.cfg.samples * self.cfg.horizon)
 
-    def _prior(self, x: Tensor, steps: int) -> Tensor:
-        """Knots of the guess from `steps` after entry on, (n, K, nu)."""
-        assert self.guess is not None
-        at = steps + torch.linspace(0, self.cfg.horizon - 1, self.cfg.knots)
-        low = at.floor().long().clamp(max=len(self.guess) - 1)
-        high = (low + 1).clamp(max=len(self.guess) - 1)
-        w = (at - at.floor())[:, None]
-        return ((1 - w) * self.guess[low] + w * self.guess[high]).to(x).expand(len(x), -1, -1)
+    def _constants(self, like: Tensor) -> Constants:
+        """What plans are made with, once a device and type: to copy it there again would be to wait."""
+        key = like.device, like.dtype
+        if key not in self._there:
+            horizon, knots = self.cfg.horizon, self.cfg.knots
+            at = torch.linspace(0, horizon - 1, knots)
+            then = at + self.cfg.replan_every
+            later = _interpolate(then / (horizon - 1) * (knots - 1), knots)
+            lower, upper, spline, basis, later = (
+                each.to(like) for each in (self.lower, self.upper, self.spline, self.basis, later)
+            )
+            guess = None if self.guess is None else self.guess.to(like.device)
+            inside, at = int((then <= horizon - 1).sum()), at.to(like.device)
+            self._there[key] = Constants(lower, upper, spline, basis, later, inside, at, guess)
+        return self._there[key]
 
-    def _shift(self, theta: Tensor, x: Tensor, taken: Tensor) -> Tensor:
+    def _prior(self, like: Tensor, steps: Tensor, first: int = 0) -> Tensor:
+        """Knots from `first` on of the guess, `steps` (n,) after entry, (n, K - first, nu), typed as `like`."""
+        its = self._constants(like)
+        assert its.guess is not None
+        at = steps.to(its.at.dtype)[:, None] + its.at[first:]
+        low = at.floor().long().clamp(max=len(its.guess) - 1)
+        high = (low + 1).clamp(max=len(its.guess) - 1)
+        w = (at - at.floor())[..., None]
+        return ((1 - w) * its.guess[low] + w * its.guess[high]).to(like)
+
+    def _shift(self, theta: Tensor, taken: Tensor) -> Tensor:
         """Plans `replan_every` steps later; what newly appears comes from the guess, else holds."""
-        started = taken > 0
-        if not started.any():
+        its, moving = self._constants(theta), taken > 0
+        if theta.device.type == "cpu" and not moving.any():  # to look is to wait elsewhere
             return theta
-        at = torch.linspace(0, self.cfg.horizon - 1, self.cfg.knots) + self.cfg.replan_every
-        w = _interpolate(at / (self.cfg.horizon - 1) * (self.cfg.knots - 1), self.cfg.knots).to(theta)
-        moved = w @ theta
-        if self.guess is not None:
-            beyond = (at > self.cfg.horizon - 1).nonzero().squeeze(1)
-            for steps in taken[started].unique():
-                rows = taken == steps
-                fresh = self._prior(x[rows], int(steps))
-                held = moved[rows]
-                held[:, beyond] = fresh[:, beyond]
-                moved[rows] = held
-        return torch.where(started[:, None, None], moved, theta)
+        moved = its.later @ theta
+        if its.guess is not None:
+            moved = torch.cat([moved[:, : its.inside], self._prior(theta, taken, its.inside)], 1)
+        return torch.where(moving[:, None, None], moved, theta)
 
     def _replan_known(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
         """`_replan`, once for each situation: schedules with a common beginning share it, and a search
@@ -254,8 +296,9 @@ class SamplingMpc(Mode):
         keys = [row.tobytes() for row in rows]
         new = {key: i for i, key in enumerate(keys) if key not in self._known}
         if new:
-            at = torch.tensor(list(new.values()), device=x.device)
-            found = self._replan(x[at], u[at], theta[at], k[at])
+            first = list(new.values())
+            at, steps = upload(np.array(first), x.device), torch.from_numpy(rows[first, -1]).long()
+            found = self._replan(x[at], u[at], theta[at], steps)
             self._known.update(zip(new, found, strict=True))
         plans = torch.stack([self._known[key] for key in keys])
         while len(self._known) > self.MEMO:
@@ -271,8 +314,11 @@ class SamplingMpc(Mode):
     def _update(
         self, x: Tensor, u: Tensor, theta: Tensor, std: Tensor | None, k: Tensor, iteration: int
     ) -> tuple[Tensor, Tensor | None, tuple[Tensor, Tensor]]:
-        """Knots and standard deviation of the noise after one update; the plans tried and their costs."""
-        noise = self._noise(k, iteration).to(x) * (self.cfg.noise if std is None else std[:, None])
+        """Knots and standard deviation of the noise after one update; the plans tried and their costs.
+
+        Control steps k are on the CPU here and in what this calls, because noise is made there.
+        """
+        noise = self._noise(k, iteration, x) * (self.cfg.noise if std is None else std[:, None])
         plans = theta[:, None] + self._along_basis(noise)
         costs = torch.nan_to_num(self._rollout(x, u, plans, k), nan=torch.inf)
         move, std = METHODS[self.cfg.method](self.cfg, noise, costs)
@@ -281,12 +327,15 @@ class SamplingMpc(Mode):
     def _along_basis(self, noise: Tensor) -> Tensor:
         """Noise (..., d) as noise of the inputs, (..., nu); summed in one order, whatever the batch."""
         inputs = noise.new_zeros(*noise.shape[:-1], self.nu)
-        for along, row in zip(noise.unbind(-1), self.basis.to(noise), strict=True):
+        for along, row in zip(noise.unbind(-1), self._constants(noise).basis, strict=True):
             inputs = inputs + along[..., None] * row
         return inputs
 
-    def _noise(self, k: Tensor, iteration: int) -> Tensor:
-        """Standard normal noise of each world's samples, (n, S, K, d), by (seed, k, iteration) alone."""
+    def _noise(self, k: Tensor, iteration: int, like: Tensor | None = None) -> Tensor:
+        """Standard normal noise of each world's samples, (n, S, K, d), by (seed, k, iteration) alone.
+
+        It comes back as float64 on the CPU, or as what and where `like` is.
+        """
         steps, inverse = k.unique(return_inverse=True)
         table = []
         for step in steps.tolist():
@@ -297,13 +346,17 @@ class SamplingMpc(Mode):
             )
             z[0] = 0
             table.append(z)
-        return torch.stack(table)[inverse.cpu()]
+        noise = torch.stack(table)
+        if like is not None:
+            noise, inverse = noise.to(like, non_blocking=True), upload(inverse.numpy(), like.device)
+        return noise[inverse]
 
     def _rollout(self, x: Tensor, u: Tensor, plans: Tensor, k: Tensor) -> Tensor:
         """Costs of plans (n, S, K, nu) from states x (n, nx), (n, S), in parts of the simulator's size."""
         if self._sim is None:
             self._sim = self._make_sim(self.cfg.worlds)
         n, s = plans.shape[:2]
+        k = upload(k.numpy(), x.device)
         flat = plans.reshape(n * s, self.cfg.knots, self.nu)
         owner = torch.arange(n, device=x.device).repeat_interleave(s)
         parts = []
@@ -316,7 +369,8 @@ class SamplingMpc(Mode):
         n, horizon = len(x), self.cfg.horizon
         ids = torch.arange(n, device=sim.device)
         sim.reset(x, u, ids)
-        controls = (self.spline.to(theta) @ theta).clamp(self.lower.to(x), self.upper.to(x))
+        its = self._constants(x)
+        controls = (its.spline @ theta).clamp(its.lower, its.upper)
         states = torch.cat([x[:, None], rollout(sim, controls, ids)], 1)
         before = torch.cat([u[:, None], controls[:, :-1]], 1)
         steps = k[:, None] + torch.arange(horizon, device=k.device)

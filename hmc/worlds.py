@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hmc.modes import Mode
 from hmc.sim.base import Sim
+from hmc.sim.device import upload
 from hmc.sim.ids import Ids, count, where
 from hmc.start import Start
 from hmc.task import Task
@@ -74,9 +75,7 @@ class Worlds:
         """Which of n worlds enter a mode that the task's guards bar, (n,) bool; arguments as of `crew`."""
         rules = self.task.rules
         assert rules is not None
-        entered, chosen = (
-            torch.from_numpy(a).to(x.device) for a in (modes != before, modes.astype(np.int64))
-        )
+        entered, chosen = (upload(a, x.device) for a in (modes != before, modes.astype(np.int64)))
         barred = rules.barred(self.task.modes, entered, chosen, x, torch.full_like(chosen, k))
         return barred.cpu().numpy()
 
@@ -89,20 +88,18 @@ class Worlds:
             before: the modes that ran last, (n,); -1 for none. One that did not run before is entered first.
         """
         if self.task.modes.constants is not None:
-            held = torch.from_numpy(self.task.modes.constants.take(modes)).to(self.sim.device, self.sim.dtype)
+            held = upload(self.task.modes.constants.take(modes), self.sim.device).to(self.sim.dtype)
             return Crew(len(modes), [], held[:, None].expand(-1, self.sim.nu))
         ids, parts, new = where(ids), [], modes != before
         indices = np.flatnonzero(np.bincount(modes)).tolist()
         for index in indices:
             if len(indices) == 1:
-                flags = self._flags(new) if new.any() else None
-                parts.append(Part(self.task.modes[index], slice(None), ids, flags))
+                parts.append(Part(self.task.modes[index], slice(None), ids, self._where(new)))
                 continue
             found = np.flatnonzero(modes == index)
-            rows, entered = torch.from_numpy(found).to(self.sim.device), new[found]
+            rows, entered = upload(found, self.sim.device), self._where(new[found])
             at = rows + (ids.start or 0) if isinstance(ids, slice) else ids[rows]
-            flags = self._flags(entered) if entered.any() else None
-            parts.append(Part(self.task.modes[index], rows, at, flags))
+            parts.append(Part(self.task.modes[index], rows, at, entered))
         return Crew(len(modes), parts)
 
     def act(self, crew: Crew, x: Tensor, u: Tensor, k: int) -> Tensor:
@@ -126,8 +123,9 @@ class Worlds:
             action[part.rows] = self._act(part, x[part.rows], u[part.rows], k)
         return action
 
-    def _flags(self, flags: Flags) -> Tensor:
-        return torch.from_numpy(flags).to(self.sim.device)
+    def _where(self, flags: Flags) -> Tensor | None:
+        """Which are flagged, long; None for none of them."""
+        return upload(np.flatnonzero(flags), self.sim.device) if flags.any() else None
 
     def _act(self, part: Part, x: Tensor, u: Tensor, k: int) -> Tensor:
         """Inputs of worlds that are all in one mode, (n, nu)."""
@@ -165,7 +163,7 @@ class Part:
         mode: that acts.
         rows: which of the crew's n worlds they are.
         at: and which of the simulator's.
-        entered: those among them that enter the mode at the next step, bool; None for none of them.
+        entered: which of them enter the mode at the next step; None for none of them.
     """
 
     mode: Mode

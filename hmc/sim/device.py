@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 
 def find_device(device: str | torch.device) -> torch.device:
@@ -34,3 +38,8 @@ def devices() -> str:
 def free_memory(device: torch.device) -> float:
     """Bytes that are free on a device; without end on a CPU, which says for itself when it has no more."""
     return float("inf") if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
+
+
+def upload(values: NDArray[Any], device: torch.device) -> Tensor:
+    """An array as a tensor on a device, without waiting for what the device has to do before it."""
+    return torch.from_numpy(values).to(device, non_blocking=True)

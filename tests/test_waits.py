@@ -1,0 +1,94 @@
+"""What waits for a device in a rollout, without one: operations whose outcome the host must have to go on."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from hmc import Evaluator, make_start, rollout
+from hmc.sampling import METHODS
+from tests.test_sampling import mode, situations
+from tests.toy import Bad, Damp, Push, all_schedules, toy_task
+
+WAITING = {"_local_scalar_dense", "nonzero", "_unique2", "unique_dim", "masked_select", "equal", "is_nonzero"}
+X = [0.4, -0.2]
+
+
+class Waits(TorchDispatchMode):
+    """Counts operations that make the host wait for numbers, by name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: Counter[str] = Counter()
+
+    def __torch_dispatch__(
+        self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        name = func.overloadpacket.__name__  # type: ignore[attr-defined]
+        self.found[name] += name in WAITING
+        if name == "index" and any(each is not None and each.dtype == torch.bool for each in args[1]):
+            self.found["index by flags"] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def costs(bound: float = math.inf, worlds: int = 81) -> tuple[torch.Tensor, Evaluator]:
+    """All schedules of a toy whose third mode ends in NaN, and whose states may."""
+    task = toy_task(4, [Push(1.0), Damp(), Bad(2)], blow_up=1.6)
+    sim = task.make_sim(worlds)
+    evaluator = Evaluator(task, sim, make_start(task, sim, X))
+    return evaluator.costs(all_schedules(3, 4), bound), evaluator
+
+
+@pytest.mark.parametrize("worlds", [1, 7, 81])
+def test_what_diverges_is_found_later_at_the_same_costs(monkeypatch, worlds):
+    now, here = costs(worlds=worlds)
+    some = float(now[now.isfinite()].median())
+    bounded, _ = costs(some, worlds)
+    monkeypatch.setattr(rollout, "far", lambda device: True)
+    then, there = costs(worlds=worlds)
+    assert 0 < here.diverged == there.diverged < 81
+    assert torch.equal(then, now)
+    assert there.own_steps >= here.own_steps
+    assert torch.equal(costs(some, worlds)[0], bounded)
+
+
+def waits_of(horizon: int) -> int:
+    """Of a rollout through all schedules of two modes."""
+    task = toy_task(horizon, [Push(1.0), Damp()])
+    sim = task.make_sim(64)
+    evaluator = Evaluator(task, sim, make_start(task, sim, X))
+    schedules = all_schedules(2, horizon)
+    with Waits() as waits:
+        evaluator.costs(schedules)
+    return waits.found.total()
+
+
+def test_no_step_waits_but_for_costs(monkeypatch):
+    """Whose copies to the host a CPU does not make; the rest is of the whole rollout, whatever the horizon."""
+    here = waits_of(4), waits_of(6)
+    assert here[1] - here[0] == 2 * 2, "states and inputs of each step"
+    monkeypatch.setattr(rollout, "far", lambda device: True)
+    assert waits_of(4) == waits_of(6) == here[0] - 2 * 4
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_replan_does_not_wait(method, monkeypatch):
+    """Its noise is made on the CPU, of control steps that are known there."""
+    mpc = mode(method=method, iterations=2, elites=3, guess=torch.rand(9, 2).double())
+    x, u, k = situations(5)
+    theta = mpc.reset(x, u, k)[:, :-1].reshape(5, 3, 2)
+    noise = [mpc._noise(k, i) for i in range(2)]
+    monkeypatch.setattr(mpc, "_noise", lambda k, i, like: noise[i])
+    mpc._replan(x, u, theta, k)  # makes its simulator
+    with Waits() as waits:
+        mpc._replan(x, u, theta, k)
+    assert waits.found.total() == 0, waits.found
+    with Waits() as waits:
+        mpc.act(x, u, mpc.reset(x, u, k), k)
+    assert waits.found["nonzero"] == 1, "in how many worlds"
