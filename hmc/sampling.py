@@ -165,8 +165,8 @@ class SamplingMpc(Mode):
     Memory: the knots, then the number of steps taken since entry. The last `MEMO` re-plans are kept:
     the same situation is never rolled out twice.
 
-    On a GPU a step waits for the device once, to learn in how many worlds it re-plans, and if there are any
-    once more, for their situations: what is known already is not rolled out. The re-plan itself does not wait.
+    On a GPU a step waits for the device once, to learn in how many worlds it re-plans, and if in any, once
+    more for their situations: what is known already is not rolled out. The re-plan itself does not wait.
 
     Args:
         name: of the mode.
@@ -270,7 +270,7 @@ class SamplingMpc(Mode):
         return self._there[key]
 
     def _prior(self, like: Tensor, steps: Tensor, first: int = 0) -> Tensor:
-        """Knots from `first` on of the guess, `steps` (n,) after entry, (n, K - first, nu), typed as `like`."""
+        """Knots from `first` on of the guess, `steps` (n,) after entry, (n, K - first, nu), as `like` is."""
         its = self._constants(like)
         assert its.guess is not None
         at = steps.to(its.at.dtype)[:, None] + its.at[first:]

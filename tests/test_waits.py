@@ -70,7 +70,7 @@ def waits_of(horizon: int) -> int:
 
 
 def test_no_step_waits_but_for_costs(monkeypatch):
-    """Whose copies to the host a CPU does not make; the rest is of the whole rollout, whatever the horizon."""
+    """Whose copies to the host a CPU does not make; the rest is of the whole rollout, at any horizon."""
     here = waits_of(4), waits_of(6)
     assert here[1] - here[0] == 2 * 2, "states and inputs of each step"
     monkeypatch.setattr(rollout, "far", lambda device: True)

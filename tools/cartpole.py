@@ -41,7 +41,7 @@ def main(args: Args) -> int:
     console = Console()
     with one_line_errors():
         cfg = load(ROOT / "cfg" / "cartpole.toml", StudyCfg, args.set)
-        table = study.folder_of(args.out, cfg) / "results.csv"
+        table = study.folder_of(args.out, cfg, args.resume) / "results.csv"
     rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args, console)
     if rows is None:
         return 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,12 +49,12 @@ class Curves:
     """One training run.
 
     Attributes:
-        mode: what was trained.
+        title: what was trained.
         batch: environment steps an iteration.
         lines: tensorboard tag -> (iterations, values), (n,) each.
     """
 
-    mode: str
+    title: str
     batch: int
     lines: dict[str, tuple[np.ndarray, np.ndarray]]
 
@@ -71,10 +72,8 @@ def read(folder: Path) -> Curves:
     return Curves(config["env"]["mode"], config["env"]["worlds"] * config["ppo"]["steps"], lines)
 
 
-def main(args: Args) -> None:
-    """Draw all runs side by side."""
-    with one_line_errors():
-        runs = [read(folder) for folder in args.runs]
+def draw(runs: Sequence[Curves], out: Path) -> None:
+    """All runs side by side, as a picture."""
     figure, axes = plt.subplots(
         1, len(runs), figsize=(5 * len(runs), 3.4), sharey=True, squeeze=False, constrained_layout=True
     )
@@ -88,15 +87,22 @@ def main(args: Args) -> None:
             axis.plot(
                 steps * run.batch / 1e6, values, color="grey", linestyle=":", label="furthest open place"
             )
-        axis.set_title(run.mode)
+        axis.set_title(run.title)
         axis.set_xlabel("environment steps [million]")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8, loc="lower right")
     places = any("/success/frontier" in run.lines for run in runs)
     axes[0, 0].set_ylim(-1.05 if places else -0.05, 1.05)
     axes[0, 0].set_ylabel("share of episodes; place" if places else "share of episodes")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    save(figure, args.out)
+    save(figure, out)
+
+
+def main(args: Args) -> None:
+    """Draw all runs side by side."""
+    with one_line_errors():
+        runs = [read(folder) for folder in args.runs]
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+    draw(runs, args.out)
     print(args.out)
 
 

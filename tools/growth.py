@@ -220,7 +220,7 @@ def main(args: Args) -> int:
         cfg = replace(cfg, flip=load(FLIP, RunCfg, cfg.base))
         for factor in cfg.factors:
             settings(cfg, Job(factor.name, factor.values[0], 0))  # what is wrong with a key shows here
-        folder = study.folder_of(args.out, cfg)
+        folder = study.folder_of(args.out, cfg, args.resume)
     console = Console()
     rows = study.carry_out(partial(work, cfg), jobs(cfg), folder / "rows.csv", Row, args, console)
     if rows is None:

@@ -95,7 +95,7 @@ def main(args: Args) -> int:
     with one_line_errors():
         cfg = study_cfg(ROOT / "cfg" / "robustness.toml", RobustnessCfg, args.set)
         flip_task(cfg.flip.task)  # what is wrong with a policy file shows here
-        table = study.folder_of(args.out, cfg) / "results.csv"
+        table = study.folder_of(args.out, cfg, args.resume) / "results.csv"
     rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args, console)
     if rows is None:
         return 1

@@ -8,6 +8,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, fields
@@ -55,10 +56,12 @@ class Workers:
         processes: jobs at the same time on this machine, a core each; 0 for as many as there are cores.
         ray: work on a Ray cluster instead, a core a job: that at an address such as 10.0.0.1:6379; without
             one, the cluster that this machine is part of, or else one of this machine alone.
+        resume: go on from what an earlier run of the same study has done; --no-resume drops that.
     """
 
     processes: int = 0
     ray: Annotated[str, ADDRESS] | None = None
+    resume: bool = True
 
     @property
     def cores(self) -> int:
@@ -66,14 +69,16 @@ class Workers:
         return self.processes or os.cpu_count() or 1
 
 
-def folder_of(out: Path, cfg: Any) -> Path:
-    """Where the table of a study under these settings grows; others begin anew.
+def folder_of(out: Path, cfg: Any, resume: bool = True) -> Path:
+    """Where the table of a study under these settings grows; others begin anew, this one without `resume`.
 
     Raises:
         ValueError: nothing can be written there.
     """
     folder = out / hashlib.sha256(dump(cfg).encode()).hexdigest()[:12]
     try:
+        if not resume and folder.exists():
+            shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ".probe").write_text("", encoding="utf-8")
         (folder / ".probe").unlink()
@@ -86,6 +91,10 @@ def _itself(row: Any) -> Any:
     return row
 
 
+def _nobody(rows: Any) -> None:
+    del rows
+
+
 def carry_out(
     work: Callable[[Any], Any],
     jobs: Sequence[Any],
@@ -94,6 +103,7 @@ def carry_out(
     workers: Workers,
     console: Console,
     receive: Callable[[Any], R] = _itself,
+    tell: Callable[[list[R]], None] = _nobody,
 ) -> list[R] | None:
     """Do what the table lacks; all rows in the order of the jobs, or None when stopped by Ctrl-C.
 
@@ -107,13 +117,16 @@ def carry_out(
         console: where progress is shown.
         receive: what makes a row, in this process, where `work` returns more than that; files are written
             here, because another machine has other folders.
+        tell: told the rows so far, in the order of the jobs, whenever one is added.
     """
     rows = {row.job: row for row in read(table, kind)} if table.exists() else {}
     todo = [job for job in jobs if job not in rows]
     try:
         for row in map(receive, run_all(work, todo, workers, console)):
             rows[row.job] = row
-            write(table, [rows[job] for job in jobs if job in rows])
+            found = [rows[job] for job in jobs if job in rows]
+            write(table, found)
+            tell(found)
     except KeyboardInterrupt:
         done = sum(job in rows for job in jobs)
         console.print(f"stopped with {done} of {len(jobs)} done: the same command goes on from there")

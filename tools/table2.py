@@ -118,7 +118,7 @@ def main(args: Args) -> int:
         cfg = study_cfg(ROOT / "cfg" / "table2.toml", Table2Cfg, args.set)
         flip_task(cfg.flip.task)  # what is wrong with a policy file shows here
         told(cfg)
-        folder = study.folder_of(args.out, cfg)
+        folder = study.folder_of(args.out, cfg, args.resume)
     (folder / "runs").mkdir(exist_ok=True)
     rules = tuned(cfg, folder / "rules.json", console)
     do, receive = partial(work, cfg, rules), partial(keep, folder / "runs")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -92,8 +93,13 @@ def under_torchrun(args: Args) -> Args:
     return replace(args, device=f"cuda:{local}", seed=args.seed + 1000 * rank)
 
 
-def set_up(args: Args) -> Runner:
-    """Everything that training needs; what the user got wrong is a ValueError."""
+def set_up(args: Args, argv: Sequence[str] | None = None) -> Runner:
+    """Everything that training needs; what the user got wrong is a ValueError.
+
+    Args:
+        args: what to train.
+        argv: the command line that asks for it, which the policy will name; None for this program's.
+    """
     cfg = read_training(args.mode, args.name, args.set)
     args = under_torchrun(args)
     torch.manual_seed(args.seed)
@@ -105,7 +111,7 @@ def set_up(args: Args) -> Runner:
         torch.set_num_threads(args.threads)
     device = None if args.device == "auto" else args.device
     env = make_env(cfg.env, args.engine, device=device, threads=args.threads, seed=args.seed)
-    meta = metadata(cfg, sys.argv[1:], args.seed)
+    meta = metadata(cfg, sys.argv[1:] if argv is None else argv, args.seed)
     runner = Runner(env, rsl_config(cfg.ppo), str(args.folder), str(env.device), meta)
     checkpoint = args.checkpoint or (args.folder / "latest.pt" if args.resume else None)
     if args.stage and not args.resume:
