@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import warnings
 from collections.abc import Iterator
+from typing import TextIO
 
 
 @contextlib.contextmanager
@@ -13,7 +15,24 @@ def one_line_errors() -> Iterator[None]:
     """Exit with status 2 and one line on ValueError and OSError, which is what bad input raises.
 
     For the part of a program that reads what the user gave. HMC_TRACEBACK=1 shows where it came from.
+    What warns of something meanwhile, such as a driver that lacks something, has one line for it, too.
     """
+    shown = warnings.showwarning
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if category is UserWarning:
+            print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+        else:
+            shown(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show
     try:
         yield
     except (ValueError, OSError) as error:
@@ -22,3 +41,5 @@ def one_line_errors() -> Iterator[None]:
         text = " ".join(str(error).split())
         print(f"error: {text}", file=sys.stderr)
         raise SystemExit(2) from None
+    finally:
+        warnings.showwarning = shown

@@ -17,6 +17,7 @@ from hmc.evaluate import Evaluator
 from hmc.memory import make_worlds
 from hmc.schedule import Schedule, Switch, SwitchSpace
 from hmc.sim.base import Sim
+from hmc.sim.check import tell_overflow
 from hmc.solvers import ORDERS, SOLVERS, Search, run
 from hmc.start import Start, Vector, make_start
 from hmc.task import Task
@@ -268,6 +269,7 @@ def plan(
         raise PlanInterrupted(_plan(search, incumbent)) from None
     search.evaluator.follow(search.schedule)
     meter.settle()
+    tell_overflow(search.evaluator.sim)
     return _plan(search, incumbent)
 
 

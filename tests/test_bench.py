@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 
 from tools.bench import main
 from tools.benchmarks.engine import Engine
-from tools.benchmarks.figures import Common, Figures
+from tools.benchmarks.figures import AT_LEAST, AT_MOST, Common, Figures
 from tools.benchmarks.gpu import Gpu
 from tools.benchmarks.growth import Growth
 from tools.benchmarks.planner import Planner
@@ -56,7 +57,9 @@ SMALL = {
             "exact_t3_ms",
             "exact_t3_efficiency",
             "exact_t3_candidates_per_s",
-            "exact_t3_c_ms",
+            "exact_t3_c1_ms",
+            "batch_2_ms",
+            "batch_2_c1_ms",
             "mppi_4x6_ms",
         },
     ),
@@ -115,6 +118,11 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     if name == "gpu":
         assert "there is only cpu" in said
         assert "what ran instead is a tiny size on Warp's CPU device" in said
+        targets = {name for name in (*AT_LEAST, *AT_MOST) if re.search(r"_(4096|8192|t75)", name)}
+        missing = {name for name, value in written.items() if value == "not measured"}
+        assert len(targets) == 6
+        assert targets | {"step_8192_bare_steps_per_s", "crossover_switches"} <= missing
+        assert said.count("not measured") == len(missing)
 
 
 def test_a_share_of_the_time_is_a_share(tmp_path: Path) -> None:

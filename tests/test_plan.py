@@ -340,3 +340,14 @@ def test_arrays_and_tensors_are_fine_as_states():
     wanted = plan(toy_task(6), FAR)
     assert plan(toy_task(6), torch.tensor(FAR, dtype=torch.float64)) == wanted
     assert plan(toy_task(6), torch.tensor(FAR, dtype=torch.float64).numpy()) == wanted
+
+
+def test_what_did_not_fit_is_said():
+    class Tight(ToySim):
+        def overflow(self):
+            return {"constraints": 0, "contacts": 1234}
+
+    with pytest.warns(
+        UserWarning, match="did not fit and count as diverged: 1,234 by contacts; .* contacts="
+    ):
+        plan(replace(toy_task(3), make_sim=Tight), FAR)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+from importlib import metadata
 
 import mujoco
 import pytest
 import torch
 
 from hmc.go2.model import HOME, load_model
+from hmc.go2.task import FlipCfg, flip_task
+from hmc.sim import make
+from hmc.sim.check import tell_overflow
 from hmc.sim.device import find_device
 from hmc.sim.make import make_sim
 from hmc.sim.mujoco import MujocoSim
@@ -42,6 +46,27 @@ def test_no_gpu(model):
         ValueError, match=r"engine warp wants a GPU and there is only cpu .*: take engine mujoco"
     ):
         make_sim(model, 2, "warp")
+
+
+def test_packages_that_are_too_old_for_each_other(model, monkeypatch):
+    version = metadata.version
+    monkeypatch.setattr(metadata, "version", lambda name: "3.2.9" if name == "mujoco" else version(name))
+    make.misfit.cache_clear()
+    try:
+        with pytest.raises(
+            ValueError, match=r"mujoco 3\.2\.9, .* do not go together \(mujoco-warp wants muj"
+        ):
+            make_sim(model, 1, "warp", device="cpu")
+    finally:
+        make.misfit.cache_clear()
+    monkeypatch.undo()
+    assert make.misfit() == ""
+
+
+@pytest.mark.skipif(not NO_GPU, reason="there is a GPU")
+def test_a_task_says_at_once_that_its_engine_is_not_there():
+    with pytest.raises(ValueError, match="engine warp wants a GPU"):
+        flip_task(FlipCfg(engine="warp"))
 
 
 @pytest.mark.parametrize("engine", ["auto", "mujoco", "warp"])
@@ -111,6 +136,12 @@ def test_too_little_room_is_never_silent(model):
     assert torch.isfinite(sim.x()).all(1).tolist() == [True, False, True]
     assert sim.overflow() == {"constraints": 1, "contacts": 0}
     assert sim.overflow() == {"constraints": 0, "contacts": 0}
+    sim.step(u[1:2], torch.tensor([1]))
+    tell_overflow(sim)  # a world that is lost already needs no room
+    sim.reset(x, u)
+    sim.step(u)
+    with pytest.warns(UserWarning, match="did not fit .*: 1 by constraints; give the simulator more constr"):
+        tell_overflow(sim)
 
 
 def test_default_room_is_enough(model):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -15,6 +16,7 @@ import torch
 import warp as wp
 
 from hmc import plan
+from hmc.cli import one_line_errors
 from hmc.go2.ensemble import EnsembleCfg
 from hmc.go2.model import SUBSTEPS, load_model
 from hmc.go2.stances import FOOTSTAND
@@ -134,7 +136,7 @@ def fake_gpu(monkeypatch, *, warp: bool = True, pools: bool = True, loops: bool 
     return torch.device("cuda", 0)
 
 
-def test_drivers(monkeypatch):
+def test_drivers(monkeypatch, capsys):
     assert cuda.graphs(torch.device("cpu")) == (False, False)
     assert cuda.graphs(fake_gpu(monkeypatch)) == (True, True)
     with pytest.warns(UserWarning, match=r"CUDA 12\.2\) lacks loops .* 12\.4; the contact solver") as said:
@@ -142,6 +144,13 @@ def test_drivers(monkeypatch):
     with pytest.warns(UserWarning, match=r"lacks memory pools in CUDA graphs; each kernel starts alone"):
         assert cuda.graphs(fake_gpu(monkeypatch, pools=False)) == (False, False)
     assert "\n" not in str(said[0].message)
+    with one_line_errors(), warnings.catch_warnings():
+        warnings.simplefilter("always")
+        cuda.graphs(fake_gpu(monkeypatch, loops=False))
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(
+        "warning: engine warp is slower here: the driver of cuda:0 (CUDA 12.2) lacks loops"
+    )
     with pytest.raises(ValueError, match=r"torch finds cuda:0 but Warp .* driver: .* engine mujoco"):
         cuda.graphs(fake_gpu(monkeypatch, warp=False))
 

@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from tools.benchmarks.engine import Engine, engine
-from tools.benchmarks.figures import cores, machine
+from tools.benchmarks.figures import NOT_MEASURED, cores, machine
 from tools.benchmarks.gpu import Gpu, gpu
 from tools.benchmarks.growth import Growth, growth
 from tools.benchmarks.planner import Planner, planner
@@ -56,7 +56,8 @@ def main(args: Engine | Train | Planner | Wire | Growth | Gpu) -> int:
     console.print(", ".join(f"{key} {value}" for key, value in host.items()), highlight=False)
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
-        write_json(args.json, {"bench": name, **figures.values, "machine": host})
+        missing = dict.fromkeys(figures.missing, NOT_MEASURED)
+        write_json(args.json, {"bench": name, **figures.values, **missing, "machine": host})
     return 0
 
 

@@ -19,6 +19,7 @@ from rich.live import Live
 from rich.table import Table
 from rsl_rl.runners import OnPolicyRunner
 
+from hmc.sim.check import tell_overflow
 from train.env import Go2Env
 
 CHECKPOINT_KEYS = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter", "infos")
@@ -134,6 +135,7 @@ class Runner(OnPolicyRunner):
     def _log_quietly(self, **kwargs: Any) -> None:
         self.updates += 1
         self.set_learning_rate(kwargs["it"] + 1)
+        tell_overflow(self.env.sim)
         if self.logger.disable_logs:
             return
         self.table.update(kwargs, self.logger.ep_extras)

@@ -270,7 +270,11 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
         cfg: settings.
         seed: of the jump's noise and of the ensemble.
         threads: of the engine and the policies; 0 for all cores.
+
+    Raises:
+        ValueError: the engine or the device is not there, or a policy file is of no use.
     """
+    engines.choose(cfg.engine, cfg.device or None)
     coarse: dict[str, Any] = {"substeps": cfg.substeps, "iterations": cfg.iterations, "threads": threads}
     coarse |= {"engine": cfg.engine, "device": cfg.device}
     sim = partial(make_sim, **coarse)

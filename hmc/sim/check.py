@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from hmc.sim.base import Sim
 from hmc.sim.ids import Ids, count
 
 
@@ -45,3 +47,18 @@ def check_latency(latency: int | Sequence[int], worlds: int, substeps: int) -> l
             f"each of the {worlds}; got {latency}"
         )
     return late
+
+
+def tell_overflow(sim: Sim) -> None:
+    """Warn of world-steps that were spoiled since the last time because contacts or constraints did not fit.
+
+    Waits for the device. Engines without an `overflow` have room for all.
+    """
+    lost = {what: number for what, number in getattr(sim, "overflow", dict)().items() if number > 0}
+    if lost:
+        found = ", ".join(f"{number:,} by {what}" for what, number in lost.items())
+        names = "= and ".join(lost)
+        warnings.warn(
+            f"world-steps that did not fit and count as diverged: {found}; give the simulator more {names}=",
+            stacklevel=2,
+        )

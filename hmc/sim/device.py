@@ -32,7 +32,7 @@ def devices() -> str:
         return "there are cpu, " + ", ".join(f"cuda:{i}" for i in range(count))
     if torch.version.cuda is None:
         return "there is only cpu (this torch is built without CUDA)"
-    return "there is only cpu (no GPU, or no NVIDIA driver)"
+    return "there is only cpu (no GPU, or an NVIDIA driver that is missing or too old)"
 
 
 def free_memory(device: torch.device) -> float:

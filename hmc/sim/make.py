@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from functools import cache
 from importlib import metadata
 from typing import TYPE_CHECKING
 
@@ -23,6 +25,35 @@ def installed() -> str:
     """The packages behind engine warp with their versions, in words."""
     names = ("mujoco", "mujoco-warp", "warp-lang")
     return ", ".join(f"{name} {metadata.version(name)}" for name in names)
+
+
+@cache
+def misfit() -> str:
+    """What mujoco-warp wants of the packages that it works on and does not get; mostly nothing."""
+    for wanted in metadata.requires("mujoco-warp") or ():
+        found = re.fullmatch(r"(mujoco|warp-lang)>=([\d.]+)", wanted)
+        if found is not None and _numbers(metadata.version(found[1])) < _numbers(found[2]):
+            return f"mujoco-warp wants {wanted}"
+    return ""
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(part) for part in re.findall(r"\d+", version)[:3]]
+
+
+def choose(engine: str, device: str | torch.device | None = None) -> tuple[str, torch.device | None]:
+    """The engine that a name stands for on this machine, and the device if one is named; see `make_sim`."""
+    if engine not in ENGINES:
+        raise ValueError(f"unknown engine {engine!r}: choose one of {', '.join(ENGINES)}")
+    there = None if device is None else find_device(device)
+    if engine == "auto":
+        cuda = torch.cuda.is_available() if there is None else there.type == "cuda"
+        engine = "warp" if cuda else "mujoco"
+    if engine == "mujoco" and there is not None and there.type != "cpu":
+        raise ValueError(f"engine mujoco runs on the CPU, not on {device}: leave device out, or take warp")
+    if engine == "warp" and there is None and not torch.cuda.is_available():
+        raise ValueError(f"engine warp wants a GPU and {devices()}: take engine mujoco, its fast CPU sibling")
+    return engine, there
 
 
 def make_sim(
@@ -53,26 +84,18 @@ def make_sim(
     Raises:
         ValueError: an engine that is not known, a device that does not exist, or the two do not fit.
     """
-    if engine not in ENGINES:
-        raise ValueError(f"unknown engine {engine!r}: choose one of {', '.join(ENGINES)}")
-    there = None if device is None else find_device(device)
-    if engine == "auto":
-        cuda = torch.cuda.is_available() if there is None else there.type == "cuda"
-        engine = "warp" if cuda else "mujoco"
+    engine, there = choose(engine, device)
     if engine == "mujoco":
-        if there is not None and there.type != "cpu":
-            raise ValueError(
-                f"engine mujoco runs on the CPU, not on {device}: leave device out, or take warp"
-            )
         from hmc.sim.mujoco import MujocoSim
 
         return MujocoSim(
             model, num_worlds, substeps=substeps, threads=threads, latency=latency, models=models
         )
-    if there is None and not torch.cuda.is_available():
-        raise ValueError(f"engine warp wants a GPU and {devices()}: take engine mujoco, its fast CPU sibling")
     try:
         from hmc.sim.warp import WarpSim
+
+        if wrong := misfit():
+            raise ImportError(wrong)
     except ModuleNotFoundError as error:
         raise ValueError(
             f"engine warp needs {error.name}: pip install 'hmc[warp]', or take mujoco"

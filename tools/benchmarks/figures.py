@@ -37,6 +37,9 @@ AT_MOST = {
 }
 
 
+NOT_MEASURED = "not measured"
+
+
 @dataclass(frozen=True)
 class Common:
     """What all measurements take.
@@ -52,10 +55,11 @@ class Common:
 
 @dataclass
 class Figures:
-    """Figures by name, each with the words that explain it in the table."""
+    """Figures by name, each with the words that explain it in the table; `missing` are not measured here."""
 
     values: dict[str, float] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
 
     def add(self, name: str, value: float, note: str) -> None:
         """Take down one figure."""
@@ -75,6 +79,10 @@ class Figures:
                     met = "[green]met[/]" if sign * value >= sign * targets[name] else "[red]not met[/]"
                     target = f"{'>=' if sign > 0 else '<='} {targets[name]:,g}  {met}"
             view.add_row(name, f"{value:,.{digits}f}", target, escape(self.notes[name]))
+        for name, note in self.missing.items():
+            goal = f">= {AT_LEAST[name]:,g}" if name in AT_LEAST else ""
+            goal = f"<= {AT_MOST[name]:,g}" if name in AT_MOST else goal
+            view.add_row(name, NOT_MEASURED, goal, escape(note))
         return view
 
 

@@ -15,24 +15,26 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from hmc import ModeSet, SwitchSpace, Task, plan
+from hmc import Budget, ModeSet, Plan, Sim, SwitchSpace, Task, plan
 from hmc.cfg import load
 from hmc.go2.model import HOME, Q_LOWER, Q_UPPER, SUBSTEPS, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, jump_mode, policy_path
+from hmc.memory import make_worlds
 from hmc.sim.cuda import num_bytes
 from hmc.sim.device import devices
 from hmc.sim.make import make_sim
 from hmc.sim.warp import WarpSim
 from tools import closed_loop
 from tools.benchmarks.engine import add_ratio, same, take_turns
-from tools.benchmarks.figures import Common, Figures
+from tools.benchmarks.figures import Common, Figures, cores
 from tools.benchmarks.train import Train, iterations
 from train.config import ROOT, read_training
 from train.make import make_env
 
 # without a GPU: so little that Warp's CPU device gets through it
 TINY: dict[str, Any] = {
+    "batches": (2,),
     "worlds": (4,),
     "steps": 2,
     "repeats": 1,
@@ -49,6 +51,8 @@ class Gpu(Common):
     """Engine warp on this machine's GPU; without one, a tiny run on Warp's CPU device that tests the path.
 
     Attributes:
+        tiny: whether a run without a GPU is tiny; with --no-tiny it has the sizes that are asked for.
+        batches: switches at once, on engine warp and on the C engine with 2 threads and with all.
         worlds: numbers of worlds to step and to train in.
         steps: control steps of a repeat.
         repeats: of what is timed.
@@ -59,6 +63,8 @@ class Gpu(Common):
         set: overrides of cfg/handstand.toml.
     """
 
+    tiny: bool = True
+    batches: tuple[int, ...] = (16, 128, 1024, 4096)
     worlds: tuple[int, ...] = (4096, 8192)
     steps: int = 50
     repeats: int = 5
@@ -74,9 +80,11 @@ def gpu(args: Gpu) -> Figures:
     """Stepping, the environment, training, exact plans and MPPI on engine warp."""
     figures, device = Figures(), "cuda"
     if not torch.cuda.is_available():
-        args, device = replace(args, **TINY), "cpu"
+        device, size = "cpu", "a tiny size" if args.tiny else "all of it"
+        if args.tiny:
+            figures.missing, args = listed(args), replace(args, **TINY)
         figures.notes["gpu"] = (
-            f"{devices()}: what ran instead is a tiny size on Warp's CPU device, whose figures say "
+            f"{devices()}: what ran instead is {size} on Warp's CPU device, whose figures say "
             "nothing of a GPU"
         )
     else:
@@ -88,6 +96,24 @@ def gpu(args: Gpu) -> Figures:
         _training(figures, args, device, worlds)
     _planning(figures, args, device)
     return figures
+
+
+def listed(args: Gpu) -> dict[str, str]:
+    """Figures that only a GPU has, with words for each."""
+    search = f"exact_t{args.horizon}"
+    found = {}
+    for worlds in args.worlds:
+        found[f"step_{worlds}_bare_steps_per_s"] = "physics steps/s of mujoco_warp alone, in the same run"
+        found[f"step_{worlds}_efficiency"] = "the simulator's rate over that"
+        found[f"env_{worlds}_efficiency"] = "the environment's rate over that"
+        found[f"train_{worlds}_steps_per_s"] = "environment steps/s, learning included"
+        found[f"memory_{worlds}_kb"] = "device memory a world, all included [KiB]"
+    found[f"{search}_ms"] = "the single-switch problem solved exactly [ms]"
+    found[f"{search}_candidates_per_s"] = "schedules a second"
+    found[f"{search}_efficiency"] = "physics steps/s of the search over the bare engine's"
+    found["crossover_switches"] = "the smallest batch that takes less time than on the C engine's threads"
+    found[f"mppi_{args.samples}x{args.plan_steps}_ms"] = "an MPPI update [ms]"
+    return found
 
 
 class Bare:
@@ -222,30 +248,43 @@ def _planning(figures: Figures, args: Gpu, device: str) -> None:
     modes = ModeSet([task.modes["foot"], task.modes["hand"], third])
     small = replace(task, modes=modes, horizon=args.horizon, rules=None)
     x, u = closed_loop.disturbed_start(cfg.start, 0)
-    size = len(SwitchSpace(3, args.horizon))
-    worlds, found = max(args.worlds), {}
-    for engine in ("warp", "mujoco"):
-        on = {"device": device} if engine == "warp" else {"threads": args.threads}
-        sim = make_sim(load_model(), worlds, engine, **on)
-        solve = partial(exact, small, sim, x.to(sim.device, sim.dtype), u.to(sim.device, sim.dtype), size)
-        found[engine] = 1e3 * seconds(solve, device, args.repeats)
-        result = solve()
-        if engine == "warp":
-            name = f"exact_t{args.horizon}"
-            rate = result.control_steps * SUBSTEPS / (found[engine] / 1e3)
-            bare = figures.values[f"step_{worlds}_bare_steps_per_s"]
-            figures.add(
-                f"{name}_efficiency", rate / bare, "physics steps/s of the search over the bare engine's"
-            )
-            figures.add(f"{name}_candidates_per_s", 1e3 * result.draws / found[engine], "schedules a second")
-            figures.add(
-                f"{name}_ms", found[engine], f"the best of {size:,} switches, M 3, three policies [ms]"
-            )
-    figures.add(
-        f"exact_t{args.horizon}_c_ms",
-        found["mujoco"],
-        f"the same on the C engine, {args.threads} threads [ms]",
-    )
+    size, name = len(SwitchSpace(3, args.horizon)), f"exact_t{args.horizon}"
+    everyone = args.threads or cores()
+
+    def on(engine: str, threads: int = 0) -> Task:
+        """The task on an engine: the search has as many worlds as fit."""
+        where = {"device": device} if engine == "warp" else {"threads": threads}
+        return replace(small, make_sim=lambda worlds: make_sim(load_model(), worlds, engine, **where))
+
+    def took(task: Task, switches: int) -> tuple[float, Plan]:
+        """How long the best of so many switches takes [ms], and what was found."""
+        sim = make_worlds(task, switches + 1)
+        start = x.to(sim.device, sim.dtype), u.to(sim.device, sim.dtype)
+        solve = partial(exact, task, sim, *start, switches)
+        return 1e3 * seconds(solve, device, args.repeats), solve()
+
+    ms, result = took(on("warp"), size)
+    rate = result.control_steps * SUBSTEPS / (ms / 1e3)
+    bare = figures.values[f"step_{max(args.worlds)}_bare_steps_per_s"]
+    figures.add(f"{name}_efficiency", rate / bare, "physics steps/s of the search over the bare engine's")
+    figures.add(f"{name}_candidates_per_s", 1e3 * result.draws / ms, "schedules a second")
+    figures.add(f"{name}_ms", ms, f"the best of {size:,} switches, M 3, three policies [ms]")
+    for threads in sorted({min(2, everyone), everyone}):
+        other, _ = took(on("mujoco", threads), size)
+        figures.add(f"{name}_c{threads}_ms", other, "the same on the C engine's threads [ms]")
+    sooner = []
+    for switches in args.batches:
+        ms, _ = took(on("warp"), switches)
+        figures.add(f"batch_{switches}_ms", ms, f"{switches} of them at once [ms]")
+        for threads in sorted({min(2, everyone), everyone}):
+            other, _ = took(on("mujoco", threads), switches)
+            figures.add(f"batch_{switches}_c{threads}_ms", other, "the same on the C engine's threads [ms]")
+        if ms < other:
+            sooner.append(switches)
+    if sooner and "crossover_switches" not in figures.missing:
+        figures.add("crossover_switches", sooner[0], "the smallest batch that is sooner than on all threads")
+    elif not sooner:
+        figures.notes["crossover"] = "no batch of switches was sooner than on all threads of the C engine"
     knots = min(cfg.task.jump.sampling.knots, args.plan_steps)
     settings = replace(
         cfg.task.jump.sampling,
@@ -269,10 +308,12 @@ def _planning(figures: Figures, args: Gpu, device: str) -> None:
     )
 
 
-def exact(task: Task, sim: Any, x: Tensor, u: Tensor, size: int) -> Any:
-    """The single-switch problem from a foot stand, solved exactly."""
+def exact(task: Task, sim: Sim, x: Tensor, u: Tensor, size: int) -> Plan:
+    """The single-switch problem from a foot stand: the best of `size` switches, drawn if that is not all."""
     foot = ["foot"] * task.horizon
-    return plan(task, x, u=u, schedule=foot, solver="exhaustive", samples=size, iterations=1, sim=sim)
+    solver = "exhaustive" if size == len(SwitchSpace(len(task.modes), task.horizon)) else "sample"
+    return plan(task, x, u=u, schedule=foot, solver=solver, samples=size, iterations=1, sim=sim,
+                budget=Budget(draws=size))  # fmt: skip
 
 
 def replan(mpc: Any, x: Tensor, u: Tensor, steps: Iterator[int]) -> None:
