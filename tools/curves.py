@@ -1,4 +1,7 @@
-"""Learning curves of training runs: `python tools/curves.py out/train/handstand out/train/footstand`."""
+"""Learning curves of training runs: `python tools/curves.py out/train/handstand out/train/footstand`.
+
+Runs on several engines or with several seeds are compared by when each comes to the same success.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +34,21 @@ CURVES = {
 }
 
 
+TIMES = ("Perf/collection_time", "Perf/learning_time")  # of each iteration [s]
+
+
 @dataclass(frozen=True)
 class Args:
     """Command line.
 
     Attributes:
         runs: folders of train/ppo.py.
+        level: success whose first time is told of each run.
         out: picture to write.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
+    level: float = 0.9
     out: Path = ROOT / "out" / "train" / "learning.png"
 
 
@@ -65,11 +73,21 @@ def read(folder: Path) -> Curves:
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
     lines = {}
-    for tag in (*CURVES, "/success/frontier"):
+    for tag in (*CURVES, "/success/frontier", *TIMES):
         if tag in events.Tags()["scalars"]:
             last = {event.step: event.value for event in events.Scalars(tag)}
             lines[tag] = np.array(sorted(last)), np.array([last[step] for step in sorted(last)])
     return Curves(config["env"]["mode"], config["env"]["worlds"] * config["ppo"]["steps"], lines)
+
+
+def reached(run: Curves, tag: str, level: float) -> tuple[float, float] | None:
+    """Environment steps [million] and training time [min] up to where a curve first comes to a level."""
+    steps, values = run.lines[tag]
+    there = steps[values >= level]
+    if len(there) == 0:
+        return None
+    spent = (seconds[at <= there[0]].sum() for at, seconds in (run.lines[tag] for tag in TIMES))
+    return float((there[0] + 1) * run.batch / 1e6), float(sum(spent) / 60)
 
 
 def draw(runs: Sequence[Curves], out: Path) -> None:
@@ -103,6 +121,11 @@ def main(args: Args) -> None:
         runs = [read(folder) for folder in args.runs]
         args.out.parent.mkdir(parents=True, exist_ok=True)
     draw(runs, args.out)
+    for run in runs:
+        for tag in filter(run.lines.__contains__, CURVES):
+            found = reached(run, tag, args.level)
+            when = "not reached" if found is None else f"{found[0]:.2f} million steps, {found[1]:.1f} minutes"
+            print(f"{run.title}, {CURVES[tag]} {args.level:g}: {when}")
     print(args.out)
 
 
