@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from hmc.go2.task import (
     flip_task,
     jump_mode,
     make_sim,
+    policy_path,
     stance_cost,
     timeline,
 )
@@ -190,3 +192,16 @@ def test_the_task(tmp_path):
     assert (sim.num_worlds, sim.nx, sim.nu, sim.dt) == (2, 37, 12, 0.02)
     with pytest.raises(ValueError, match=r"nothing\.onnx: no such file"):
         flip_task(FlipCfg(foot=policy, hand=str(tmp_path / "nothing.onnx")), threads=1)
+
+
+def test_a_policy_that_is_missing_says_how_it_is_made():
+    with pytest.raises(
+        ValueError, match=r"hop\.onnx: no such file: make it with python train/ppo\.py --mode hop,"
+    ):
+        policy_path("hop")
+    with pytest.raises(
+        ValueError, match=r"--mode hop, then .* out/train/hop/latest\.pt .*hop_value\.onnx --value"
+    ):
+        policy_path("hop_value")
+    assert policy_path("handstand").is_file()
+    assert policy_path("handstand", "elsewhere.onnx") == Path("elsewhere.onnx")

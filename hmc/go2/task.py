@@ -201,8 +201,20 @@ def _targets(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, 
 
 
 def policy_path(name: str, given: str = "") -> Path:
-    """The policy file of a stance: the given one, else the one that comes with the package."""
-    return Path(given) if given else Path(str(resources.files("hmc.go2") / "policies" / f"{name}.onnx"))
+    """The policy file of a mode: the given one, else the one that comes with the package.
+
+    Raises:
+        ValueError: the package has none of this name; says how it is made.
+    """
+    path = Path(given) if given else Path(str(resources.files("hmc.go2") / "policies" / f"{name}.onnx"))
+    if not given and not path.is_file():
+        mode = name.removesuffix("_value")
+        value = "" if mode == name else " --value"
+        raise ValueError(
+            f"policy {path}: no such file: make it with python train/ppo.py --mode {mode}, then "
+            f"python train/export.py out/train/{mode}/latest.pt {path}{value}"
+        )
+    return path
 
 
 def jump_mode(cfg: JumpCfg, make_sim: Callable[[int], Sim], seed: int) -> Mode:
