@@ -195,12 +195,10 @@ def test_the_task(tmp_path):
 
 
 def test_a_policy_that_is_missing_says_how_it_is_made():
-    with pytest.raises(
-        ValueError, match=r"hop\.onnx: no such file: make it with python train/ppo\.py --mode hop,"
-    ):
+    with pytest.raises(ValueError, match=r"hop\.onnx: no such file: .* train/ppo\.py --mode hop,"):
         policy_path("hop")
     with pytest.raises(
-        ValueError, match=r"--mode hop, then .* out/train/hop/latest\.pt .*hop_value\.onnx --value"
+        ValueError, match=r"--mode hop, .* out/train/hop/latest\.pt .*hop_value\.onnx --value"
     ):
         policy_path("hop_value")
     assert policy_path("handstand").is_file()
