@@ -27,6 +27,7 @@ from deploy.memory import Memory  # noqa: E402
 from deploy.process import ENVIRONMENT, Job, spawn  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
+from deploy.timing import Stolen  # noqa: E402
 from deploy.view import View  # noqa: E402
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
@@ -228,7 +229,7 @@ def main(args: Args) -> int:
         for name in ("run.mcap", "truth.npz", "summary.json"):
             (args.out / name).unlink(missing_ok=True)
     truth = args.out / "truth.npz" if args.simulated else None
-    memory = Memory({})
+    memory, stolen = Memory({}), Stolen()
     try:
         with contextlib.suppress(KeyboardInterrupt):
             if args.simulated:
@@ -243,6 +244,7 @@ def main(args: Args) -> int:
 
     with one_line_errors():
         summary = {**summarise(args.out / "run.mcap", truth), "memory_mb": memory.found}
+        summary["stolen"] = share if (share := stolen.share) is None else round(share, 4)
     write(args.out / "summary.json", summary)
     console.print_json(data=summary)
     reached = summary["stages_true"] if args.simulated else summary["stages"]

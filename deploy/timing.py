@@ -1,12 +1,14 @@
-"""How late the control steps are, by the robot's clock."""
+"""How late the control steps are, by the robot's clock; and whether the machine had its cores for itself."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
+from pathlib import Path
 
 EDGES = (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # ms; the last bin has no end
 _WINDOW = 100  # ticks
+_STAT, _STEAL = Path("/proc/stat"), 7  # Linux; field of its first line
 
 
 class Lateness:
@@ -34,3 +36,23 @@ class Lateness:
     def __len__(self) -> int:
         """How many ticks."""
         return sum(self.bins)
+
+
+class Stolen:
+    """How much of the cores' time the host of a virtual machine has given to others since this was made."""
+
+    def __init__(self) -> None:
+        self._before = _times()
+
+    @property
+    def share(self) -> float | None:
+        """Of the time of all cores; None where the kernel does not tell."""
+        spent = [now - before for now, before in zip(_times(), self._before, strict=True)]
+        return spent[_STEAL] / sum(spent) if len(spent) > _STEAL and sum(spent) > 0 else None
+
+
+def _times() -> list[int]:
+    """What the cores spent their time on: user, nice, system, idle, I/O, interrupts (2), stolen."""
+    if not _STAT.exists():
+        return []
+    return [int(field) for field in _STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy import memory
+from deploy import memory, timing
 from deploy.ekf import N, R
 from deploy.memory import Memory
 from deploy.summary import accuracy
+from deploy.timing import Stolen
 from hmc.go2.stances import FOOTSTAND
 
 
@@ -52,3 +53,14 @@ def test_the_estimate_against_the_truth(tmp_path):
         {"velocity_rms": 0.05, "height_max": 0.02, "height_last": 0.02, "height_sigmas_max": 2.0}
     )
     assert accuracy(tmp_path / "truth.npz", ticks[4:]) is None
+
+
+def test_time_that_the_host_took(tmp_path, monkeypatch):
+    stat = tmp_path / "stat"
+    monkeypatch.setattr(timing, "_STAT", stat)
+    assert Stolen().share is None, "a kernel that does not tell"
+    stat.write_text("cpu  100 0 50 800 0 0 0 40 0 0\ncpu0 1 2 3\n", encoding="ascii")
+    stolen = Stolen()
+    assert stolen.share is None, "no time has passed"
+    stat.write_text("cpu  160 0 60 810 0 0 0 60 0 0\ncpu0 1 2 3\n", encoding="ascii")
+    assert stolen.share == pytest.approx(20 / 100)
