@@ -33,7 +33,8 @@ def make_env(cfg: UnifiedCfg = CFG) -> UnifiedEnv:
 
 
 def opened(starts: UnifiedStarts) -> UnifiedStarts:
-    """The same, its handstand reached from everywhere."""
+    """The same, its foot stand held, its handstand reached from everywhere."""
+    starts.stances[0].rates[STANCE] = 0.9
     starts.stances[1].success[:] = 1.0
     return starts
 
@@ -41,6 +42,8 @@ def opened(starts: UnifiedStarts) -> UnifiedStarts:
 def test_what_is_asked_for_is_where_it_begins_or_the_other_one():
     torch.manual_seed(0)
     env = make_env(UnifiedCfg("unified", worlds=50, footstand=STANCES, handstand=STANCES))
+    env.starts.stances[0].rates[STANCE] = 0.9
+    env._reset(torch.arange(50))
     foot = env._kind == STANCE
     assert foot.tolist() == [True] * 20 + [False] * 30
     assert torch.equal(env.command[:, 0], torch.where(foot, -1.0, 1.0))
@@ -49,10 +52,12 @@ def test_what_is_asked_for_is_where_it_begins_or_the_other_one():
         assert torch.equal(group[:, OBS_SIZE], env.command[:, 0])
 
 
-def test_nobody_flips_before_the_way_is_open():
+def test_what_cannot_be_learned_yet_is_not_asked_for():
     torch.manual_seed(1)
     starts = UnifiedStarts(CFG, CPU)
     starts.goals = torch.arange(300) % 3
+    assert starts.draw(300).kind.tolist() == [STANCE] * 300
+    starts.stances[0].rates[STANCE] = 0.51
     assert starts.draw(300).kind.tolist() == [STANCE, HAND + STANCE, HAND + STANCE] * 100
     start = opened(starts).draw(300)
     assert start.kind.tolist() == [STANCE, HAND + STANCE, FLIP] * 100

@@ -21,6 +21,7 @@ from train.starts import KINDS, STANCE, Starts, StartsCfg
 GOALS = (FOOTSTAND, HANDSTAND)  # command -1 and +1
 FLIP = len(GOALS) * len(KINDS)  # kind of start: the foot stand, which is told to flip
 MIRROR = (1.0,)  # of the command
+HELD = 0.5  # share of episodes in the foot stand from which on others are drawn
 # joint targets are about the pose of the stance that is asked for: half way between both and command x this
 TOWARDS = (HANDSTAND.pose - FOOTSTAND.pose) / 2
 
@@ -84,10 +85,14 @@ class UnifiedStarts:
         return torch.cat([*each, self._shares[2:]])
 
     def draw(self, n: int) -> Start:
-        """The next n starts, one for each of `goals`."""
-        # nobody flips who cannot rise into the handstand
-        ready = self.stances[1].frontier() <= Starts.HORIZONTAL
-        goal = self.goals if ready else self.goals.clamp(max=1)
+        """The next n starts, one for each of `goals`, or for what can be learned by now.
+
+        That is the foot stand first: beside a handstand that is half learned, it is not learned at all. And
+        nobody flips who cannot rise into the handstand.
+        """
+        foot, hand = self.stances
+        held, risen = bool(foot.rates[STANCE] > HELD), hand.frontier() <= Starts.HORIZONTAL
+        goal = self.goals.clamp(max=2 if held and risen else 1 if held else 0)
         drawn = [source.draw(n) for source in self._sources]
         x, u, kind, cell = (
             torch.stack(parts)[goal, torch.arange(n, device=self.device)]
