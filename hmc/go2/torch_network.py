@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 
-def _gemm(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    return torch.addmm(bias, x, weight.T)
+def _gemm(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    return x @ weight.T if bias is None else torch.addmm(bias, x, weight.T)
 
 
 OPERATIONS: dict[str, Callable[..., Tensor]] = {
