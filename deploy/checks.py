@@ -89,7 +89,7 @@ class StateChecks:
 
     def _range(self, state: RobotState) -> str:
         """What of a frame cannot be; comparisons are written so that NaN fails them."""
-        # one comparison for all: the frame's numbers lie side by side, and most frames are good
+        # one comparison for all numbers: most frames are good, and what is wrong can be found out afterwards
         numbers = np.concatenate((state.quat, state.gyro, state.acc, state.q, state.dq, state.tau))
         fits = np.abs(numbers - self._middle) <= self._width
         if fits.all() and 0.9 < float(state.quat @ state.quat) < 1.1:
