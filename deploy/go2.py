@@ -55,7 +55,7 @@ class Args:
         foot: policy file of the foot stand; default: the one that comes with the package.
         hand: policy file of the handstand, likewise.
         set: overrides of cfg/deploy.toml, such as plan.lead=100.
-        task_set: overrides of the task in cfg/flip.toml, such as substeps=2.
+        task_set: overrides of the task in cfg/flip.toml, after those of cfg/planner.toml, such as substeps=2.
         search: overrides of cfg/planner.toml, such as search.draws=16.
         threads: of the planner's engine; 0 for all cores.
         hold: of the foot stand before the handstand is asked for, on the stand-in [s].

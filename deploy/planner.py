@@ -35,13 +35,13 @@ class PlannerCfg:
     """cfg/planner.toml.
 
     Attributes:
+        task: overrides of the task in cfg/flip.toml for plans on the way, as on a command line.
         lead: control steps from a plan's begin until the handstand is wanted, while the first way to it is
             looked for.
         rest: horizon of plans in which no flip is looked for, in control steps: before the handstand is asked
             for, and once the robot is in it.
         first: effort of a plan then: the robot stands and can wait.
         search: effort of every other plan.
-        mpc: whether the jump is planned by sampling MPC inside the plans; else its guess is played as it is.
         others: robots that a flip is tried on before it is sent.
         landed: share of them and the nominal one that have to end in the handstand.
         patience: flips in a row that too few land, after which the first way is looked for anew.
@@ -50,9 +50,9 @@ class PlannerCfg:
             others landed.
     """
 
+    task: tuple[str, ...] = ()
     lead: int = 45
     rest: int = 40
-    mpc: bool = False
     others: EnsembleCfg = field(default_factory=EnsembleCfg)
     landed: float = 0.8
     patience: int = 5
@@ -106,7 +106,6 @@ class Planner:
         threads: int = 0,
         speed: float = 1.0,
     ):
-        task = replace(task, jump=replace(task.jump, mpc=cfg.mpc))
         self._horizon, self._tick = task.horizon, DT / speed
         if not max(cfg.lead, cfg.rest - 1) < self._horizon <= STEPS:
             raise ValueError(
@@ -138,7 +137,7 @@ class Planner:
         """Plan once for nothing: what is made on first use is made then."""
         x = FOOTSTAND.state()
         start = make_start(self.task, self._sim, x, x[7:19], k=self._wanted)
-        flip = [FOOT] * 10 + [JUMP] * 35 + [HAND] * (self._horizon - 45)
+        flip = ([FOOT] * 10 + [JUMP] * 20 + [HAND] * self._horizon)[: self._horizon]
         plan(self.task, start, schedule=flip, sim=self._sim, **self._cfg.search.options())
 
     @property
@@ -303,11 +302,9 @@ def main(job: Job) -> None:
     if not allowed():
         os.nice(NICE)
     torch.set_num_threads(1)
-    task = load(job.task, FlipCfg, job.task_set, table="task")
-    cfg, rules = (
-        load(ROOT / "cfg" / "planner.toml", PlannerCfg, job.search),
-        load(job.cfg, DeployCfg, job.set).plan,
-    )
+    cfg = load(ROOT / "cfg" / "planner.toml", PlannerCfg, job.search)
+    task = load(job.task, FlipCfg, (*cfg.task, *job.task_set), table="task")
+    rules = load(job.cfg, DeployCfg, job.set).plan
     run(
         Board(job.board),
         Planner(task, cfg, rules, seed=job.seed, threads=job.threads, speed=job.speed),

@@ -30,10 +30,9 @@ CFG = load(Path("cfg/deploy.toml"), DeployCfg)
 
 def planner(delay: int, seed: int = 0, *overrides: str) -> Planner:
     """As deployed, but it reckons with a planning time of so many ticks."""
-    task = load(Path("cfg/flip.toml"), FlipCfg, table="task")
-    made = Planner(
-        task, load(Path("cfg/planner.toml"), PlannerCfg, overrides), CFG.plan, seed=seed, threads=1
-    )
+    cfg = load(Path("cfg/planner.toml"), PlannerCfg, overrides)
+    task = load(Path("cfg/flip.toml"), FlipCfg, cfg.task, table="task")
+    made = Planner(task, cfg, CFG.plan, seed=seed, threads=1)
     made.seconds = deque([delay * DT] * 3)
     return made
 
@@ -142,18 +141,18 @@ def test_a_flip_is_left_alone_until_the_handstand_and_given_up_if_it_is_not_take
 def test_before_it_is_asked_for_the_foot_stand_goes_on() -> None:
     record = planner(5).plan(situation(asked=-1), 5)
     assert record is not None
-    assert record["modes"][: record["steps"]].tolist() == [FOOT] * 40
+    assert record["modes"][: record["steps"]].tolist() == [FOOT] * 30
 
 
 def test_in_the_handstand_plans_are_short() -> None:
-    it = planner(5, 0, "rest=30")
+    it = planner(5, 0, "rest=20")
     x = HANDSTAND.state().numpy()
     record = it.plan(situation(x=x, u=x[7:19], mode=HAND), 5)
     assert record is not None
-    assert record["modes"][: record["steps"]].tolist() == [HAND] * 30
+    assert record["modes"][: record["steps"]].tolist() == [HAND] * 20
 
 
-@pytest.mark.parametrize("wrong", ["lead=75", "rest=76"])
+@pytest.mark.parametrize("wrong", ["lead=50", "rest=51"])
 def test_plans_that_do_not_fit_into_the_horizon(wrong: str) -> None:
     with pytest.raises(
         ValueError, match=r"horizon must be more than the lead of \d+ control steps, at least"
@@ -170,9 +169,9 @@ def test_other_robots_land_a_flip_and_not_a_fall() -> None:
     it, alone = planner(5), planner(5, 0, "others.members=0")
     x, horizon = FOOTSTAND.state(), it.task.horizon
     start = make_start(it.task, it._one, x, x[7:19], mode="foot", memory=[0.0, 0.0, 1.0, 0.0])
-    flip = [FOOT] * 15 + [JUMP] * 18 + [HAND] * (horizon - 33)
-    fall = [FOOT] * 15 + [HAND] * (horizon - 15)
-    assert it.landed(start, flip) >= 6 / 9
+    flip = [FOOT] * 5 + [JUMP] * 21 + [HAND] * (horizon - 26)
+    fall = [FOOT] * 5 + [HAND] * (horizon - 5)
+    assert it.landed(start, flip) >= 8 / 9
     assert it.landed(start, fall) == 0.0
     assert it.landed(start, flip) == it.landed(start, flip)
     assert alone.landed(start, flip) == 1.0
