@@ -29,6 +29,7 @@ from deploy.settings import DeployCfg, InputCfg
 from deploy.slots import Board, said, text
 from deploy.timing import Lateness
 from hmc.cfg import load
+from hmc.go2 import facts
 from hmc.go2.network import Network
 
 PRIORITY = 50
@@ -132,6 +133,9 @@ class Loop:
             self._logged = command
         if ticked:
             self._tell(now, left)
+        elif now - self._company > 1.0:  # takes as long as a tick does: never before a command
+            self._company = now
+            self._look_around()
         if control.phase != self._phase or control.machine.hint != self._hint:
             self._phase, self._hint = control.phase, control.machine.hint
             why = control.machine.reason or self._hint
@@ -155,11 +159,13 @@ class Loop:
                 self._take(record)
         told = board.plan.read() if control.phase == Phase.READY else None
         control.planner = told is not None and now - float(told["t"]) < _PRESENCE
-        if now - self._company > 1.0:
-            self._company = now
-            ours = () if guard is None else (int(guard["pid"]),)
-            if others := self._link.rivals("rt/lowcmd", ours):
-                control.fail(f"another program commands the motors: {others[0]}")
+
+    def _look_around(self) -> None:
+        """Fail where another program commands the motors as well."""
+        guard = self._board.guard.read()
+        ours = () if guard is None else (int(guard["pid"]),)
+        if others := self._link.rivals("rt/lowcmd", ours):
+            self._control.fail(f"another program commands the motors: {others[0]}")
 
     def _take(self, record: np.ndarray) -> None:
         """A plan has come."""
@@ -243,7 +249,10 @@ def policies(foot: str, hand: str) -> dict[int, Network]:
     """The policies of the modes that have one; ValueError if a file is not for this robot."""
     given = {FOOT: foot, HAND: hand}
     own = {mode: ROOT / "hmc" / "go2" / "policies" / f"{NAMES[mode]}stand.onnx" for mode in given}
-    return {mode: Network(Path(path) if path else own[mode]) for mode, path in given.items()}
+    made = {mode: Network(Path(path) if path else own[mode]) for mode, path in given.items()}
+    for network in made.values():  # the first inference takes several times as long as others: not in a tick
+        network.run(np.zeros((1, facts.OBS_SIZE), np.float32))
+    return made
 
 
 def run(job: Job, stopped: Callable[[], bool]) -> None:
