@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -43,7 +43,7 @@ def test_the_stance_at_rest_earns_all_and_costs_nothing(stance):
     earned = {"height": 1.0, "orientation": 1.0, "stillness": 1.0}
     costs = {name: 0.0 for name in found if name not in earned}
     assert found == pytest.approx(earned | costs, abs=1e-9)
-    assert set(found) == {field.name for field in fields(RewardCfg)} - {"termination"}
+    assert set(found) == {field.name for field in fields(RewardCfg)} - {"termination", "pace"}
 
 
 def test_weights_scale_their_terms():
@@ -67,6 +67,8 @@ def test_orientation(tilt, earned):
 def test_stillness_is_height_and_orientation_at_rest():
     fast = moved(x2=0.45, x19=0.6, x21=0.8, x23=2.0)
     assert terms(x=fast)["stillness"] == pytest.approx(math.exp(-1) * math.exp(-1 - 0.4))
+    strict = replace(ONES, pace=0.5)
+    assert terms(x=fast, cfg=strict)["stillness"] == pytest.approx(math.exp(-1) * math.exp(-4 - 0.4))
 
 
 def test_free_feet_on_the_ground_are_counted():

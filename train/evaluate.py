@@ -53,12 +53,14 @@ class Held:
         velocity: mean after `SETTLE` in the frame of the robot's heading, (n, 3) [m/s, m/s, rad/s].
         power: sum of |torque x speed| over the joints, mean of all steps in which it is held [W].
         rate: change of the joint targets from step to step, root mean square of them likewise [rad].
+        speed: of the base over the ground, mean likewise [m/s].
     """
 
     held: Tensor
     velocity: Tensor
     power: float
     rate: float
+    speed: float
 
 
 def held_over_time(
@@ -76,7 +78,7 @@ def held_over_time(
     k = torch.zeros(len(push[0]), dtype=torch.long)
     u = robots.u
     memory = policy.reset(robots.estimate(), u, k)
-    good, velocity, power, rate = [], [], [], []
+    good, velocity, power, rate, speed = [], [], [], [], []
     for step in range(steps):
         if step == round(SETTLE / robots.sim.dt) and bool((push[0] > 0).any()):
             robots.push(*push)
@@ -87,12 +89,14 @@ def held_over_time(
         velocity.append(heading_velocity(x))
         power.append((robots.sim.actuator_force() * x[:, 25:37]).abs().sum(1)[good[-1]])
         rate.append((action - u).square().mean(1)[good[-1]])
+        speed.append(x[:, 19:21].norm(dim=1)[good[-1]])
         u = action
     return Held(
         torch.stack(good),
         torch.stack(velocity[round(SETTLE / robots.sim.dt) :]).mean(0),
         float(torch.cat(power).mean()),
         float(torch.cat(rate).mean().sqrt()),
+        float(torch.cat(speed).mean()),
     )
 
 
@@ -234,7 +238,8 @@ def main(args: Args) -> None:
     reach, keep = PROTOCOLS[args.starts]
     print(f"{policy.network.mode} from {args.starts}: within {reach} s and held {keep} s: {result}")
     print(
-        f"  while held: joint power {found.power:.1f} W, targets change by {found.rate:.3f} rad a step (rms)"
+        f"  while held: joint power {found.power:.1f} W, targets change by {found.rate:.3f} rad a step (rms), "
+        f"speed over the ground {found.speed:.2f} m/s"
     )
     if isinstance(starts, Starts) and starts.records is not None and "after" in starts.records:
         for moment, part in by_moment(good, starts.records["after"]).items():
@@ -242,7 +247,7 @@ def main(args: Args) -> None:
     if args.json is not None:
         low, high = result.interval
         data = {"success": result.success, "episodes": result.episodes, "low": low, "high": high}
-        data |= {"power": found.power, "rate": found.rate}
+        data |= {"power": found.power, "rate": found.rate, "speed": found.speed}
         args.json.write_text(json.dumps(data) + "\n", encoding="utf-8")
 
 

@@ -40,7 +40,8 @@ class RewardCfg(EffortCfg):
     Attributes:
         height: exp(-max(0, target - z) / 0.1), z the base height [m].
         orientation: ((1 + cos tilt) / 2)^2.
-        stillness: height x orientation x exp(-|v|^2 - 0.1 |omega|^2), v [m/s], omega [rad/s].
+        stillness: height x orientation x exp(-|v / pace|^2 - 0.1 |omega|^2), v [m/s], omega [rad/s].
+        pace: speed at which stillness has fallen to 1 / e [m/s].
         contact: number of free feet on the ground.
         posture: sum of squared deviations of the free legs from the stance's pose [rad^2].
         stance_posture: the same for the supporting legs.
@@ -50,6 +51,7 @@ class RewardCfg(EffortCfg):
     height: float = 1.0
     orientation: float = 1.0
     stillness: float = 0.5
+    pace: float = 1.0
     contact: float = 0.3
     posture: float = 0.1
     stance_posture: float = 0.05
@@ -89,7 +91,7 @@ def stage_rewards(
     q, qd = x[:, 7:19], x[:, 25:37]
     height = torch.exp(-(TARGET_HEIGHT - x[:, 2]).clamp(min=0) / 0.1)
     orientation = (0.5 * stance.uprightness(x) + 0.5).square()
-    still = torch.exp(-x[:, 19:22].square().sum(1) - 0.1 * x[:, 22:25].square().sum(1))
+    still = torch.exp(-(x[:, 19:22] / cfg.pace).square().sum(1) - 0.1 * x[:, 22:25].square().sum(1))
     off = (q - stance.pose.to(q)).square().reshape(-1, 2, 6).sum(2)  # of the front and the rear pair
     torque = go2.motor_torque(q, qd, u)
     return {
