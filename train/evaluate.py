@@ -238,8 +238,8 @@ def main(args: Args) -> None:
     reach, keep = PROTOCOLS[args.starts]
     print(f"{policy.network.mode} from {args.starts}: within {reach} s and held {keep} s: {result}")
     print(
-        f"  while held: joint power {found.power:.1f} W, targets change by {found.rate:.3f} rad a step (rms), "
-        f"speed over the ground {found.speed:.2f} m/s"
+        f"  while held: joint power {found.power:.1f} W, speed over the ground {found.speed:.2f} m/s, "
+        f"targets change by {found.rate:.3f} rad a step (rms)"
     )
     if isinstance(starts, Starts) and starts.records is not None and "after" in starts.records:
         for moment, part in by_moment(good, starts.records["after"]).items():
