@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from hmc.sim.check import check
 from hmc.sim.ids import Ids, fresh, where
 
 Floats = NDArray[np.float64]
+T = TypeVar("T", float, Tensor)
 BLOCK = 4096  # worlds that are stepped at a time: what is computed on the way stays in the cache
 
 
@@ -69,16 +72,16 @@ class CartpoleSim:
             raise ValueError(f"expected dt > 0 and substeps >= 1, got dt={dt}, substeps={substeps}")
         self.params = params or CartpoleParams()
         self._dt, self._substeps = dt, substeps
-        self._cart_mass = torch.tensor(self.params.cart_mass, dtype=torch.float64)
         self._columns = torch.zeros(6, num_worlds, dtype=torch.float64)  # all of one quantity side by side
         h, c = dt / substeps, self.params
         scale = h * h / 4
         push, pull = scale * c.gear / (c.pole_mass * c.pole_length), scale * c.gravity / c.pole_length
-        # as arrays without a dimension, which numpy takes as they are
-        self._factors = (
-            tuple(map(np.array, (push, pull, c.cart_mass / c.pole_mass, h / 2, c.pole_length * 2 / 3))),
-            np.array([[1 / 3], [2 / (3 * h)], [c.pole_length * 2 / (3 * h)]]),
-        )
+        self._scale = push, pull, c.cart_mass / c.pole_mass, h / 2, c.pole_length * 2 / 3
+        self._weights = 1 / 3, 2 / (3 * h), c.pole_length * 2 / (3 * h)
+        # as arrays, which numpy takes as they are
+        self._factors = tuple(map(np.array, self._scale)), np.array(self._weights)[:, None]
+        self._one = np.empty((3, 1))  # an angle, its sine and its cosine
+        self._of_one = tuple(map(torch.from_numpy, self._one))
         self._scratch = np.empty((17, min(num_worlds, BLOCK)))
 
     @property
@@ -122,6 +125,11 @@ class CartpoleSim:
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
         columns, force = self._columns.numpy(), u[:, 0].to(self.dtype).numpy()
+        if len(force) == 1:  # a plan steps hundreds of worlds singly, for which arrays are slow
+            at = int(ids[0]) if isinstance(ids, Tensor) else (ids or slice(None)).indices(self.num_worlds)[0]
+            *x, _, time = columns[:, at].tolist()
+            columns[:, at] = *self._after(x, force.item(), self._sin_cos), force[0], time + self._dt
+            return
         some = columns.take(ids.numpy(), 1) if isinstance(ids, Tensor) else columns[:, where(ids)]
         for first in range(0, len(force), BLOCK):
             part = slice(first, first + BLOCK)
@@ -132,10 +140,9 @@ class CartpoleSim:
             columns[:, ids.numpy()] = some
 
     def _move(self, x: Floats, u: Floats) -> None:
-        """Move states (4, n) one control step on under inputs (n,): `advance`, in place and up to rounding.
+        """Move states (4, n) one control step on under inputs (n,): `_after` in place, to the bit.
 
-        With w = h / 2 theta', a = h^2 / 4 theta'' and q = h^2 / (4 l) p'' the stages take the fewest
-        operations; numpy is the quicker one to call, torch has the faster sine.
+        Numpy is the quicker one to call, torch has the faster sine.
         """
         (push, pull, mass, half, far), weights, add, multiply = *self._factors, np.add, np.multiply
         theta, p, theta_dot, p_dot = x
@@ -192,26 +199,50 @@ class CartpoleSim:
             add(p_dot, first[2], p_dot)
 
     def advance(self, x: Tensor, u: Tensor) -> Tensor:
-        """States (n, 4) one control step after x under inputs u (n, 1); differentiable."""
-        theta, p, theta_dot, p_dot = x.unbind(1)
-        force = self.params.gear * u[:, 0]
-        h = self._dt / self._substeps
+        """States (n, 4) one control step after x under inputs u (n, 1): what `step` makes; differentiable."""
+        after = self._after(x.unbind(1), u[:, 0], lambda angle: (angle.sin(), angle.cos()))
+        return torch.stack(after).T
+
+    def _after(self, x: Sequence[T], u: T, sin_cos: Callable[[T], Sequence[T]]) -> list[T]:
+        """The state one control step after x = (theta, p, theta', p') under u: numbers, or one a world.
+
+        With w = h / 2 theta', a = h^2 / 4 theta'' and q = h^2 / (4 l) p'' the stages take the fewest
+        operations.
+        """
+        (push, pull, mass, half, far), weights = self._scale, self._weights
+        theta, p, theta_dot, p_dot = x
+        force = u * push
+
+        def rate(angle: T, w: T) -> tuple[T, T]:
+            """a and q = (F + sin (w^2 - g cos)) / (M + sin^2), all of them scaled."""
+            sin, cos = sin_cos(angle)
+            q = ((w * w - cos * pull) * sin + force) / (sin * sin + mass)
+            return sin * pull - q * cos, q
+
         for _ in range(self._substeps):
-            # the four stages' velocities (v, w) and accelerations (a, b) of pole and cart
-            v1, (a1, b1) = theta_dot, self._rate(theta, theta_dot, force)
-            v2 = torch.add(v1, a1, alpha=h / 2)
-            a2, b2 = self._rate(torch.add(theta, v1, alpha=h / 2), v2, force)
-            v3 = torch.add(v1, a2, alpha=h / 2)
-            a3, b3 = self._rate(torch.add(theta, v2, alpha=h / 2), v3, force)
-            v4 = torch.add(v1, a3, alpha=h)
-            a4, b4 = self._rate(torch.add(theta, v3, alpha=h), v4, force)
-            b = b2 + b3
-            # p is in no rate: its sum (w1 + 2 w2 + 2 w3 + w4) / 6 with w2 = p' + h b1 / 2 and so on
-            p = p + h * torch.add(p_dot, b1 + b, alpha=h / 6)
-            theta = torch.add(theta, torch.add(v1 + v4, v2 + v3, alpha=2), alpha=h / 6)
-            theta_dot = torch.add(theta_dot, torch.add(a1 + a4, a2 + a3, alpha=2), alpha=h / 6)
-            p_dot = torch.add(p_dot, torch.add(b1 + b4, b, alpha=2), alpha=h / 6)
-        return torch.stack([theta, p, theta_dot, p_dot]).T
+            w1 = theta_dot * half
+            a1, q1 = rate(theta, w1)
+            w2 = w1 + a1
+            a2, q2 = rate(w1 + theta, w2)
+            w3 = w1 + a2
+            a3, q3 = rate(w2 + theta, w3)
+            w4 = a3 + a3 + w1
+            a4, q4 = rate(w3 + w3 + theta, w4)
+            w, a, q = w2 + w3, a2 + a3, q2 + q3
+            # p is in no rate: its sum is 6 p' + h (b1 + b2 + b3)
+            p = (q1 + q) * far + p + p_dot * half + p_dot * half
+            theta = theta + ((w1 + w4) + (w + w)) * weights[0]
+            theta_dot = theta_dot + ((a1 + a4) + (a + a)) * weights[1]
+            p_dot = p_dot + ((q1 + q4) + (q + q)) * weights[2]
+        return [theta, p, theta_dot, p_dot]
+
+    def _sin_cos(self, angle: float) -> list[float]:
+        """Sine and cosine of one angle, to the bit as of many."""
+        one, sin, cos = self._of_one
+        self._one[0, 0] = angle
+        torch.sin(one, out=sin)
+        torch.cos(one, out=cos)
+        return self._one.ravel().tolist()[1:]
 
     def save(self, ids: Ids = None) -> Tensor:
         return fresh(self._columns, ids, 1).T
@@ -228,11 +259,3 @@ class CartpoleSim:
             c.pole_length * p_dot * theta_dot * theta.cos() + (c.pole_length * theta_dot) ** 2 / 2
         )
         return kinetic + c.pole_mass * c.gravity * c.pole_length * theta.cos()
-
-    def _rate(self, theta: Tensor, theta_dot: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Accelerations of pole and cart, (n,) each, in as few operations as torch has for them."""
-        c, sin, cos = self.params, theta.sin(), theta.cos()
-        swing = torch.addcmul(cos * -c.gravity, theta_dot, theta_dot, value=c.pole_length)
-        mass = torch.addcmul(self._cart_mass, sin, sin, value=c.pole_mass)
-        p_ddot = torch.addcmul(force, sin, swing, value=c.pole_mass) / mass
-        return torch.addcmul(sin * (c.gravity / c.pole_length), p_ddot, cos, value=-1 / c.pole_length), p_ddot
