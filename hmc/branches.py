@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hmc.neighbours import Neighbours
+
 
 @dataclass(frozen=True, eq=False)
 class Branches:
@@ -43,35 +45,106 @@ class Branches:
         return path
 
 
+def tree_of(
+    schedules: Tensor | Neighbours, trunk: Sequence[int], ahead: Sequence[int] | None = None
+) -> Branches:
+    """The tree of schedules (n, T), after one `ahead` of them, around `trunk` (t modes)."""
+    if isinstance(schedules, Neighbours):
+        if schedules.base.modes == tuple(trunk if ahead is None else ahead):
+            return fan(schedules, trunk, ahead is not None)
+        schedules = schedules.tensor()
+    rows = schedules.cpu()
+    if ahead is not None:
+        rows = torch.cat([torch.tensor(ahead, dtype=rows.dtype)[:, None], rows.T], 1).T
+    return branches(rows, trunk)
+
+
 def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
     """The tree of schedules (n, T), mode indices, around `trunk` (t modes)."""
-    n, horizon = schedules.shape
     steps = _steps(schedules)
+    birth, parent = _parted(steps, trunk)
+    slots = _slots(birth, parent, len(steps))
+    return _tree(torch.from_numpy(steps.take(slots, 1)).T, slots, birth, parent)
+
+
+def fan(switched: Neighbours, trunk: Sequence[int], beside: bool) -> Branches:
+    """The tree of neighbours of a schedule around `trunk` (t modes), from when they part: no two are equal.
+
+    Args:
+        switched: the neighbours.
+        trunk: of that very schedule, if it is not `beside`.
+        beside: whether that schedule is row 0 of the tree, and the neighbours come after it.
+    """
+    base, horizon, n = switched.base.modes, len(switched.base), len(switched)
+    # schedule and trunk part here; before that, all that parts from the one parts from both
+    apart = next((i for i, (a, b) in enumerate(zip(base, trunk, strict=False)) if a != b), len(trunk))
+    mode, start, stop = switched.mode, switched.start, switched.stop
+    # those of one mode and start are one until the first of them ends: they part from the one that ends last
+    longest = np.zeros(switched.num_modes * (horizon + 1), dtype=np.int64)
+    group, by_stop = mode * (horizon + 1) + start, _sorted(stop, horizon)
+    longest[group[by_stop]] = by_stop
+    stem = longest[group]
+    first = stem == np.arange(n)
+    birth = np.where(first, start, switched.changed_next)
+    parent = np.where(first, np.where(start <= apart, -1, 0), stem + beside)
+    if apart < len(trunk):  # some switch to what the trunk goes on with
+        along = np.flatnonzero((start == apart) & (mode == trunk[apart]))
+        if len(along) > 0:
+            birth[along], stems = _parted(_steps(switched[along].tensor()), trunk)
+            parent[along] = np.where(stems < 0, -1, along[stems] + beside)
+    if beside:
+        birth, parent = np.r_[apart, birth], np.r_[-1, parent]
+    slots = _slots(birth, parent, horizon)
+    if not beside:
+        return _tree(switched[slots].tensor(), slots, birth, parent)
+    modes = switched[np.maximum(slots - 1, 0)].tensor()
+    modes[int(np.flatnonzero(slots == 0)[0])] = torch.tensor(base)
+    return _tree(modes, slots, birth, parent)
+
+
+def _parted(steps: np.ndarray, trunk: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """When each of schedules (T, n) parts from which other one, -1 for the trunk: (n,) each."""
+    horizon, n = steps.shape
     order = _order(steps, trunk)
     rows = steps.take(order, 1)
     before = np.empty_like(rows)  # the one before each; the first comes after the trunk
     before[:, 1:], before[: len(trunk), 0], before[len(trunk) :, 0] = rows[:, :-1], trunk, -1
     apart = before != rows
     birth = np.where(apart.any(0), apart.argmax(0), horizon)
-    slots = np.argsort(birth.astype(np.uint16 if horizon < 2**16 else np.int64), kind="stable")
-    rank = np.empty_like(slots)
-    rank[slots] = np.arange(n)
-    born = [0, *np.cumsum(np.bincount(birth, minlength=horizon + 1)).tolist()]
     # the parent of a branch is the last one before it that was there earlier: its neighbour's ancestor
-    parent, seeds = np.full(n, -1), []
+    parent = np.full(n, -1)
     for i in range(horizon + 1):
-        here, stems = slots[born[i] : born[i + 1]], parent[born[i] : born[i + 1]]
-        if len(here) > 0 and born[i] > 0:
-            there = np.flatnonzero(birth < i)
+        here = np.flatnonzero(birth == i)
+        there = np.flatnonzero(birth < i)
+        if len(here) > 0 and len(there) > 0:
             last = np.searchsorted(there, here) - 1
-            stems[:] = np.where(last < 0, -1, rank[there[last]])
-        seeds.append(int((stems < 0).sum()))
+            parent[here] = np.where(last < 0, -1, order[there[last]])
+    place = np.empty_like(order)
+    place[order] = np.arange(n)
+    return birth[place], parent[place]
+
+
+def _slots(birth: np.ndarray, parent: np.ndarray, horizon: int) -> np.ndarray:
+    """The order of birth of branches born at steps `birth` (n,), at each step those from the trunk first."""
+    return _sorted(2 * birth + (parent >= 0), 2 * horizon + 1)
+
+
+def _sorted(values: np.ndarray, largest: int) -> np.ndarray:
+    """The stable order of values, (n,); small numbers are sorted by their digits, which is quicker."""
+    return np.argsort(values.astype(np.uint16 if largest < 2**16 else np.int64), kind="stable")
+
+
+def _tree(modes: Tensor, slots: np.ndarray, birth: np.ndarray, parent: np.ndarray) -> Branches:
+    """The tree of schedules (n, T) in order `slots` of birth, of rows that part when `_parted` says."""
+    rank = np.empty_like(slots)
+    rank[slots] = np.arange(len(slots))
+    steps, stems = modes.shape[1] + 1, parent[slots]
     return Branches(
-        row=torch.from_numpy(order[slots]),
-        modes=torch.from_numpy(rows.take(slots, 1)).T,
-        parent=torch.from_numpy(parent),
-        born=born,
-        seeds=seeds,
+        row=torch.from_numpy(slots),
+        modes=modes,
+        parent=torch.from_numpy(np.where(stems < 0, -1, rank[stems])),
+        born=[0, *np.cumsum(np.bincount(birth, minlength=steps)).tolist()],
+        seeds=np.bincount(birth[parent < 0], minlength=steps).tolist(),
     )
 
 

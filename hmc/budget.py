@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from hmc.evaluate import Evaluator
+from hmc.neighbours import Neighbours
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Meter:
             return self.budget.draws - self.draws, "draws"
         return wanted, ""
 
-    def affordable(self, schedules: Tensor) -> int:
+    def affordable(self, schedules: Tensor | Neighbours) -> int:
         """How many of schedules (n, T), the first ones, the control steps that are left suffice for.
 
         Where modes roll out inside themselves, a step is reckoned at what one took so far. What pruning

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.branches import added_steps, in_order
+from hmc.neighbours import Neighbours
 from hmc.rollout import Rolled, record, roll
 from hmc.schedule import Schedule
 from hmc.sim.base import Sim
@@ -93,35 +94,42 @@ class Evaluator:
 
     @torch.no_grad()
     def costs(
-        self, schedules: Tensor, bound: float = math.inf, stop: Callable[[], bool] | None = None
+        self,
+        schedules: Tensor | Neighbours,
+        bound: float = math.inf,
+        stop: Callable[[], bool] | None = None,
     ) -> Tensor:
         """Costs of schedules (N, T) -> (N,) float64.
 
         Args:
-            schedules: mode indices.
+            schedules: mode indices; or the neighbours of one schedule, which takes less time.
             bound: a schedule that costs more may come back as inf, because its rollout was given up on
                 the way; what costs at most `bound` is exact. Used where cost terms are non-negative.
             stop: asked before every control step; once it says True, what is not known yet comes back
                 as NaN.
         """
-        if schedules.numel() and not 0 <= int(schedules.min()) <= int(schedules.max()) < len(self.task.modes):
+        these, used = _spelt(schedules), _used(schedules)
+        if used.numel() and not 0 <= int(used.min()) <= int(used.max()) < len(self.task.modes):
             raise ValueError(
-                f"schedules hold modes {int(schedules.min())} to {int(schedules.max())}: task "
+                f"schedules hold modes {int(used.min())} to {int(used.max())}: task "
                 f"{self.task.name!r} has 0 to {len(self.task.modes) - 1}"
             )
-        rows = self._table.rows(schedules)
-        missing = np.flatnonzero(self._table.missing(rows, bound))
-        todo = missing[np.sort(np.unique(rows[missing], return_index=True)[1])]  # each once
-        todo = self._allowed(todo, rows, schedules)
+        rows = self._table.rows(these)
+        every = np.arange(len(rows))
+        earliest = np.empty(rows.max(initial=0) + 1, dtype=np.int64)
+        earliest[rows[::-1]] = every[::-1]
+        todo = np.flatnonzero((earliest[rows] == every) & self._table.missing(rows, bound))  # each once
+        todo = self._allowed(todo, rows, these)
         if len(todo) > self.size:  # neighbours share most: let them be in one chunk
-            todo = todo[in_order(_rows(schedules, todo).cpu(), self._lead)]
+            todo = todo[in_order(_rows(these, todo).cpu(), self._lead)]
         first = 0
         while first < len(todo):
             beside = self._beside
             size = self.size - len(beside)
             chunk = todo[first : first + size]
             modes = beside[0].modes if beside else None
-            rolled = roll(self._worlds, self._trunk, _rows(schedules, chunk), bound, stop, modes)
+            wanted = schedules[chunk] if isinstance(schedules, Neighbours) else _rows(schedules, chunk)
+            rolled = roll(self._worlds, self._trunk, wanted, bound, stop, modes)
             if rolled is None:
                 break
             if rolled.trace is not None:
@@ -131,11 +139,12 @@ class Evaluator:
             first += size
         return torch.from_numpy(self._table.costs(rows, bound))
 
-    def needs(self, schedules: Tensor) -> NDArray[np.int64]:
+    def needs(self, schedules: Tensor | Neighbours) -> NDArray[np.int64]:
         """Control steps, modes' own aside, that the costs of the first 1, 2, ... of schedules (N, T) take.
 
         Fewer if some are pruned or barred; none for those that break a rule.
         """
+        schedules = _spelt(schedules)
         new = self._table.missing(self._table.rows(schedules), math.inf)
         if self.task.rules is not None:
             new &= ~self._broken(schedules).cpu().numpy()
@@ -241,6 +250,18 @@ class Evaluator:
         self.ruled_out += int(rolled.barred.sum())
         cost, pruned, terms = (part.cpu().numpy() for part in (rolled.cost, rolled.pruned, rolled.terms))
         self._table.learn(rows, cost, pruned, terms)
+
+
+def _spelt(schedules: Tensor | Neighbours) -> Tensor:
+    """Schedules as mode indices, (N, T)."""
+    return schedules.tensor() if isinstance(schedules, Neighbours) else schedules
+
+
+def _used(schedules: Tensor | Neighbours) -> Tensor:
+    """All modes that occur in schedules."""
+    if isinstance(schedules, Neighbours):
+        return torch.from_numpy(np.r_[schedules.base.modes, schedules.mode])
+    return schedules
 
 
 def _rows(schedules: Tensor, at: Rows) -> Tensor:

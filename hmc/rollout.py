@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hmc.branches import Branches, branches
+from hmc.branches import Branches, tree_of
+from hmc.neighbours import Neighbours
 from hmc.sim.device import upload
 from hmc.sim.ids import Ids, blocks
 from hmc.trace import Floats, Recorder, Traces
@@ -48,7 +49,7 @@ class Rolled:
 def roll(
     worlds: Worlds,
     trunk: Traces,
-    schedules: Tensor,
+    schedules: Tensor | Neighbours,
     bound: float = math.inf,
     stop: Callable[[], bool] | None = None,
     recorded: tuple[int, ...] | None = None,
@@ -65,24 +66,22 @@ def roll(
     Args:
         worlds: where to; the first n E are used.
         trunk: where from, and what is known already; E traces, all of one schedule and one length.
-        schedules: mode indices.
+        schedules: mode indices, or the neighbours of a schedule.
         bound: where cost terms are non-negative, a schedule is given up once its partial cost, with the
             task's lower bound of the rest, exceeds this.
         stop: asked before every control step; when it says True the rollout ends with None.
         recorded: a schedule that is rolled out beside the others, whatever the bound, and recorded; the
             simulator has worlds for it too.
     """
-    rows = schedules.cpu()
-    if recorded is not None:
-        rows = torch.cat([torch.tensor(recorded, dtype=rows.dtype)[:, None], rows.T], 1).T
-    tree = branches(rows, trunk[0].modes[: len(trunk[0])])
+    tree = tree_of(schedules, trunk[0].modes[: len(trunk[0])], recorded)
+    horizon = tree.modes.shape[1]
     rollout = _Rollout(worlds, trunk, tree, bound, recorded is not None)
-    first = next((i for i, born in enumerate(tree.born[1:]) if born > 0), rows.shape[1])
-    for i in range(first, rows.shape[1] + 1):
+    first = next((i for i, born in enumerate(tree.born[1:]) if born > 0), horizon)
+    for i in range(first, horizon + 1):
         if stop is not None and stop():
             return None
         rollout.advance(i)
-    return rollout.rolled(len(rows) - len(schedules))
+    return rollout.rolled(len(tree.row) - len(schedules))
 
 
 @torch.no_grad()
@@ -191,7 +190,9 @@ class _Rollout:
             modes = tuple(tree.modes[last].tolist())
             return recorder.traces(modes, path, terms[last, :, self.stages :], barred[last])
 
-        at = tree.row.argsort()[first:]
+        at = torch.empty_like(tree.row)
+        at[tree.row] = torch.arange(len(at))
+        at = at[first:]
         known = terms[at].masked_fill(torch.from_numpy(ended | self.pruned)[at, None, None], math.nan)
         result, given_up, out = (
             torch.from_numpy(each)[at] for each in (self.result, self.pruned, self.barred)

@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hmc.neighbours import Neighbours
+
 
 @dataclass(frozen=True)
 class Switch:
@@ -164,15 +166,12 @@ class SwitchSpace:
 
     def stitch(self, schedule: Schedule, indices: Tensor) -> Tensor:
         """`schedule` with each of the switches `indices` (N,) in turn, (N, T), in a type that fits."""
-        kind = next(
-            k for k in (np.uint8, np.int16, np.int64) if max(self.num_modes, self.horizon) <= np.iinfo(k).max
-        )
+        return self.neighbours(schedule, indices).tensor()
+
+    def neighbours(self, schedule: Schedule, indices: Tensor) -> Neighbours:
+        """The same, as what differs from `schedule`."""
         mode, start, duration = (part.numpy() for part in self.split(indices.cpu()))
-        # unsigned, what lies before the start is far behind the end
-        wide = np.dtype(f"u{np.dtype(kind).itemsize}")
-        since = np.arange(self.horizon, dtype=wide)[:, None] - start.astype(wide)
-        base = np.array(schedule.modes, dtype=kind)[:, None]
-        return torch.from_numpy(np.where(since < duration.astype(wide), mode.astype(kind), base)).T
+        return Neighbours.of(schedule, self.num_modes, mode, start, start + duration)
 
 
 class Draws:

@@ -13,6 +13,7 @@ from torch import Tensor
 from hmc.budget import Meter
 from hmc.evaluate import Evaluator
 from hmc.moves import handovers, moves
+from hmc.neighbours import Neighbours
 from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
 
 Pairs = list[tuple[Switch, ...]]
@@ -89,9 +90,11 @@ class Search:
             waiting = torch.cat([waiting, order.take(size - len(waiting))])
             room, limit = self.meter.room(len(waiting))
             pairs = self._pairs(room) if beside else []
-            batch = self.space.stitch(self.schedule, waiting[:room])
+            single = self.space.neighbours(self.schedule, waiting[:room])
+            batch: Tensor | Neighbours = single
             if pairs:
                 others = np.array([self._stitched(switches).modes for switches in pairs])
+                batch = single.tensor()
                 batch = torch.cat([batch, torch.from_numpy(others).to(batch.dtype)])
             affordable = self.meter.affordable(batch)
             if 0 <= affordable < room:
@@ -132,7 +135,7 @@ class Search:
             schedule = schedule.stitch(switch)
         return schedule
 
-    def _roll(self, schedules: Tensor) -> Tensor:
+    def _roll(self, schedules: Tensor | Neighbours) -> Tensor:
         """Costs of a batch of draws (n, T), (n,); NaN where the clock cut it short."""
         stop = None if self.meter.budget.seconds is None else self.meter.expired
         costs = self.evaluator.costs(schedules, self.bound, stop)

@@ -31,7 +31,7 @@ class Table:
 
     def rows(self, schedules: Tensor) -> Rows:
         """The row of each of schedules (N, T) in this table, (N,); equal schedules have one row."""
-        small = schedules.to("cpu", self._type).contiguous().numpy()
+        small = np.ascontiguousarray(schedules.to("cpu", self._type).numpy())
         # fixed-width strings lose their trailing zeros, all of them the same way: they stay distinct
         keys = small.view(f"S{small.shape[1] * small.itemsize}")[:, 0].tolist()
         row = self._row

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hmc.branches import added_steps, branches, in_order
+from hmc import Schedule, SwitchSpace
+from hmc.branches import added_steps, branches, fan, in_order
 
 
 @given(data=st.data(), modes=st.integers(1, 300), horizon=st.integers(1, 8), n=st.integers(1, 40))
@@ -77,3 +79,39 @@ def test_added_steps_are_the_new_beginnings(data, modes, horizon, n):
         assert more == len(beginnings - seen)
         assert by_itself == len(beginnings - lead)
         seen |= beginnings
+
+
+@given(data=st.data(), modes=st.integers(1, 4), horizon=st.integers(1, 8))
+def test_a_fan_is_the_tree_of_its_schedules(data, modes, horizon):
+    """In closed form: the same beginnings, born when their stems are there, as of the schedules spelt out."""
+    mode = st.integers(0, modes - 1)
+    base = data.draw(st.lists(mode, min_size=horizon, max_size=horizon))
+    known, beside = data.draw(st.lists(mode, max_size=horizon)), data.draw(st.booleans())
+    agree = data.draw(st.integers(0, horizon))
+    trunk = (base[:agree] + known[agree:]) if beside else base
+    space = SwitchSpace(modes, horizon)
+    drawn = data.draw(st.lists(st.integers(0, len(space) - 1), min_size=1, max_size=40))
+    switched = space.neighbours(Schedule(tuple(base)), torch.tensor(drawn))
+    rows = switched.tensor()
+    names = list(zip(switched.mode.tolist(), switched.start.tolist(), switched.stop.tolist(), strict=True))
+    assert len(set(names)) == len(rows.unique(dim=0)), "equal if and only if the schedules are"
+    each = [i for i, name in enumerate(names) if name not in names[:i]]
+    if beside:
+        each = [i for i in each if rows[i].tolist() != base]
+    if not each:
+        return
+    switched, rows = switched[np.array(each)], rows[each]
+    if beside:
+        rows = torch.cat([torch.tensor([base], dtype=rows.dtype), rows])
+    tree = fan(switched, trunk, beside)
+    assert sorted(tree.row.tolist()) == list(range(len(rows)))
+    assert torch.equal(tree.modes, rows[tree.row])
+    birth = np.searchsorted(tree.born[1:], np.arange(len(rows)), "right")
+    for j, (branch, parent) in enumerate(zip(tree.modes.tolist(), tree.parent.tolist(), strict=True)):
+        stem = trunk if parent < 0 else tree.modes[parent].tolist()
+        assert branch[: birth[j]] == stem[: birth[j]]
+        assert parent < 0 or birth[parent] < birth[j]
+        assert (parent < 0) == (j - tree.born[birth[j]] < tree.seeds[birth[j]])
+    new = {tuple(row[: i + 1]) for row in rows.tolist() for i in range(horizon)}
+    new -= {tuple(trunk[: i + 1]) for i in range(len(trunk))}
+    assert horizon * len(rows) - int(birth.sum()) == len(new), "no beginning twice"
