@@ -113,12 +113,10 @@ def _parted(steps: np.ndarray, trunk: Sequence[int]) -> tuple[np.ndarray, np.nda
     birth = np.where(apart.any(0), apart.argmax(0), horizon)
     # the parent of a branch is the last one before it that was there earlier: its neighbour's ancestor
     parent = np.full(n, -1)
-    for i in range(horizon + 1):
-        here = np.flatnonzero(birth == i)
-        there = np.flatnonzero(birth < i)
-        if len(here) > 0 and len(there) > 0:
-            last = np.searchsorted(there, here) - 1
-            parent[here] = np.where(last < 0, -1, order[there[last]])
+    for i in np.unique(birth)[1:]:
+        here, there = np.flatnonzero(birth == i), np.flatnonzero(birth < i)
+        last = np.searchsorted(there, here) - 1
+        parent[here] = np.where(last < 0, -1, order[there[last]])
     place = np.empty_like(order)
     place[order] = np.arange(n)
     return birth[place], parent[place]

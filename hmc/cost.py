@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 StageFn = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
@@ -63,4 +65,12 @@ def total(terms: Tensor) -> Tensor:
     cost = terms.new_zeros(len(terms))
     for column in terms.unbind(1):
         cost = cost + column
+    return cost
+
+
+def total_by_term(terms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`total` of terms (number of terms, n), (n,): to the bit, which numpy's own sum is not."""
+    cost = np.zeros(terms.shape[1])
+    for term in terms:
+        cost += term
     return cost

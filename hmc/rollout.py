@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hmc.branches import Branches, tree_of
+from hmc.cost import total_by_term
 from hmc.neighbours import Neighbours
 from hmc.sim.device import upload
-from hmc.sim.ids import Ids, blocks
+from hmc.sim.ids import Ids, blocks, joined
 from hmc.trace import Floats, Recorder, Traces
 from hmc.worlds import Crew, Flags, Indices, Worlds, finite
 
@@ -135,7 +135,8 @@ class _Rollout:
         self.births: list[tuple[int, slice, Indices]] = []
         # what cannot end a branch on the way is looked at now and then only
         watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
-        self.at_once = 1 if watchful else STEPS
+        unlimited = self.cheap and self.limit == math.inf
+        self.at_once = 1 if watchful else self.horizon if unlimited else STEPS
         # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost
         self.later = far(self.sim.device) and not watchful and self.stages > 0
         self.constant = task.modes.constants is not None
@@ -308,7 +309,7 @@ class _Rollout:
             return
         ends = self.task.cost.terminal_terms(x, torch.full((len(x),), k, device=x.device)).to(torch.float64)
         terms = np.concatenate([self.sums, ends.cpu().numpy().T])
-        costs = _total(terms)
+        costs = total_by_term(terms)
         self.terms[:, self._blocks(self._indices)] = terms
         self.result[self.ids] = np.where(self._all(np.isfinite(costs)), self._risk(costs), math.inf)
 
@@ -319,24 +320,24 @@ class _Rollout:
             return rows
         steps, self.unpriced = self.unpriced, []
         widths, first = [x.shape[0] for _, x, _, _ in steps], k - len(steps)
-        x, u, u_prev = (
-            steps[0][1:] if len(steps) == 1 else map(torch.cat, zip(*[s[1:] for s in steps], strict=True))
-        )
+        x, u, u_prev = map(joined, zip(*[step[1:] for step in steps], strict=True))
         ks = upload(np.arange(first, k).repeat(widths), x.device)
         found = self.task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64)
         if self.later:
             found = found.masked_fill(~(finite(x) & finite(u))[:, None], math.nan)
-        terms = found.cpu().numpy() * self.sim.dt
-        for (ids, *_), stage in zip(steps, np.split(terms.T, np.cumsum(widths[:-1]), 1), strict=True):
-            sums = self._sums[:, : stage.shape[1]]
-            np.add(sums, stage, out=sums)
+        terms, done = found.cpu().numpy().T, 0
+        terms *= self.sim.dt
+        for (ids, *_), width in zip(steps, widths, strict=True):
+            stage = terms[:, done : done + width]
+            done += width
+            sums = self._sums[:, :width]
+            sums += stage
             if self.recorder is not None:
                 self.recorder.step(first - self.first, ids, stage)
             first += 1
             self.births = [(after - 1, born, of) for after, born, of in self.births]
             self._inherit()
-        sums = self.sums
-        costs = _total(sums)
+        costs = total_by_term(self.sums)
         partial = self._risk(costs)
         if sane is not None or not math.isfinite(costs.sum()) or partial.max() > self.limit:
             fine = self._all(np.isfinite(costs))
@@ -354,7 +355,7 @@ class _Rollout:
                 x, u = self._drop(bad, x, u)
         if rest is not None and self.limit < math.inf and len(x) > 0:
             steps = torch.full((len(x),), k, device=x.device)
-            least = _total(self.sums) - self.slack
+            least = total_by_term(self.sums) - self.slack
             least += rest(x, steps, self.horizon - i).to(torch.float64).cpu().numpy()
             # hopeless is pruned as well, and a bound that is no number bounds nothing
             risk = self._risk(np.nan_to_num(least, nan=0.0, posinf=math.inf, neginf=-math.inf))
@@ -392,8 +393,3 @@ def far(device: torch.device) -> bool:
 def _flags(values: Tensor) -> Flags:
     flags: Flags = values.cpu().numpy()
     return flags
-
-
-def _total(terms: Floats) -> Floats:
-    """`hmc.cost.total` of terms (number of terms, n), (n,): to the bit, which numpy's own sum is not."""
-    return reduce(np.add, terms, np.zeros(terms.shape[1]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import torch
@@ -37,3 +38,10 @@ def fresh(buffer: Tensor, ids: Ids, dim: int = 0) -> Tensor:
     if isinstance(ids, Tensor):
         return buffer.index_select(dim, ids)
     return (buffer[where(ids)] if dim == 0 else buffer[:, where(ids)]).clone()
+
+
+def joined(parts: Sequence[Tensor]) -> Tensor:
+    """The rows of all parts (n, ...), laid out as those are: by columns, if so."""
+    if len(parts) == 1:
+        return parts[0]
+    return torch.cat([part.T for part in parts], 1).T if parts[0].stride(0) == 1 else torch.cat(list(parts))
