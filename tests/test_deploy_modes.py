@@ -18,6 +18,7 @@ from deploy.slots import PLAN
 from hmc.go2 import model as go2
 from hmc.go2 import observe as theirs
 from hmc.go2.network import LOWER, UPPER, Network
+from hmc.go2.network import anchor_of as anchor_in_numpy
 from hmc.go2.network import observe as observe_in_numpy
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
@@ -45,6 +46,7 @@ def test_observation_is_that_of_training_and_planning():
     anchors, angles = theirs.anchor_of(tx).numpy(), theirs.pitch(tx).numpy()
     up = go2.vertical(tx[:, 3:7]).numpy()
     assert np.array_equal(observe_in_numpy(x, u, anchor), expected)  # to the bit
+    assert np.array_equal(anchor_in_numpy(x), theirs.anchor_of(tx).numpy())
     for i in range(len(x)):
         np.testing.assert_allclose(ours.anchor_of(x[i]), anchors[i], atol=1e-12, rtol=0)
         np.testing.assert_allclose(ours.vertical(x[i, 3:7]), up[i], atol=1e-12, rtol=0)

@@ -17,17 +17,16 @@ Array = NDArray[np.floating[Any]]
 LOWER, UPPER = np.array(facts.Q_LOWER), np.array(facts.Q_UPPER)
 
 # Entries of the rotation matrix, row by row: constant + factor (q_a q_b + sign q_c q_d), q = (w, x, y, z).
-_A, _B, _C, _D = np.array(
+_PAIRS = np.array(
     [
-        [2, 1, 1, 1, 1, 2, 1, 2, 1],
-        [2, 2, 3, 2, 1, 3, 3, 3, 1],
-        [3, 0, 0, 0, 3, 0, 0, 0, 2],
-        [3, 3, 2, 3, 3, 1, 2, 1, 2],
+        [[2, 1, 1, 1, 1, 2, 1, 2, 1], [3, 0, 0, 0, 3, 0, 0, 0, 2]],
+        [[2, 2, 3, 2, 1, 3, 3, 3, 1], [3, 3, 2, 3, 3, 1, 2, 1, 2]],
     ]
-)
-_SIGN, _FACTOR, _CONSTANT = np.array(
+)  # (a and c, b and d)
+_LAW = np.array(
     [[1, -1, 1, 1, 1, -1, -1, 1, 1], [-2, 2, 2, 2, -2, 2, 2, 2, -2], [1, 0, 0, 0, 1, 0, 0, 0, 1]], float
-)
+)[:, :, None]  # sign, factor, constant
+_LEFT = slice(1, 5, 3)  # x and y of the body's y axis
 
 
 def observe(x: Array, u: Array, anchor: Array) -> Array:
@@ -39,22 +38,37 @@ def observe(x: Array, u: Array, anchor: Array) -> Array:
         u: previous action: joint targets [rad], (n, 12).
         anchor: where the mode was entered, (n, 4): x, y [m], cos and sin of the heading.
     """
-    quat = x[:, 3:7]
-    pairs = quat[:, _A] * quat[:, _B] + _SIGN * (quat[:, _C] * quat[:, _D])
-    turn = (_CONSTANT + _FACTOR * pairs).reshape(-1, 3, 3)
-    across = turn * x[:, 19:22, None]
-    dx, dy, c, s = x[:, 0] - anchor[:, 0], x[:, 1] - anchor[:, 1], anchor[:, 2], anchor[:, 3]
+    turn = _rotation(x, slice(None)).reshape(3, 3, -1)
+    across = turn * x.T[19:22, None]
+    (px, py), (ax, ay, c, s) = x.T[:2], anchor.T
+    dx, dy = px - ax, py - ay
     out = np.empty((len(x), facts.OBS_SIZE), x.dtype)
-    np.negative(turn[:, 2], out=out[:, :3])
-    out[:, 3] = c * dx + s * dy
-    out[:, 4] = c * dy - s * dx
-    out[:, 5] = x[:, 2]
-    out[:, 6:9] = across[:, 0] + across[:, 1] + across[:, 2]
+    columns = out.T
+    np.negative(turn[2], out=columns[:3])
+    columns[3] = c * dx + s * dy
+    columns[4] = c * dy - s * dx
+    columns[5] = x.T[2]
+    columns[6:9] = across[0] + across[1] + across[2]
     out[:, 9:12] = x[:, 22:25]
     out[:, 12:24] = x[:, 7:19]
     out[:, 24:36] = x[:, 25:37]
     out[:, 36:48] = u
     return out
+
+
+def anchor_of(x: Array) -> Array:
+    """Anchor at states x (n, 37), (n, 4): that of `hmc.go2.observe.anchor_of`, by the same operations."""
+    left = _rotation(x, _LEFT)
+    across, ahead = left / np.maximum(np.sqrt(left[0] * left[0] + left[1] * left[1]), 1e-6)
+    return np.stack([x[:, 0], x[:, 1], ahead, -across], 1, dtype=x.dtype)
+
+
+def _rotation(x: Array, which: slice) -> Array:
+    """Some of the 9 entries, row by row, of the rotations body to world at states x (n, 37), (entries, n)."""
+    factors = x.T[3:7].take(_PAIRS[..., which], 0)
+    product, (sign, factor, constant) = factors[0] * factors[1], _LAW[:, which]
+    entries: Array = constant + factor * (product[0] + sign * product[1])
+    return entries
 
 
 class Network:
@@ -92,9 +106,10 @@ class Network:
         if command is not None:
             obs[:, 3:5] = 0.0
             obs = np.concatenate([obs, command], 1)
-        output = self.run(obs.astype(np.float32))
-        target = self.pose + self.scale * output.astype(np.float64)
-        return np.minimum(np.maximum(target, LOWER), UPPER)
+        target = self.pose + self.scale * self.run(obs.astype(np.float32)).astype(np.float64)
+        np.maximum(target, LOWER, out=target)
+        np.minimum(target, UPPER, out=target)
+        return target
 
     def run(self, obs: NDArray[np.float32]) -> NDArray[np.float32]:
         """The network's output, (n, 12), for observations with their commands (n, 48 + c)."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from hmc.go2 import network
 from hmc.go2.network import LOWER, UPPER, Network
 from hmc.go2.observe import anchor_of, observe
 from hmc.go2.torch_network import TorchNetwork
@@ -54,7 +55,9 @@ class Policy(Mode):
         self._devices: dict[torch.device, OnDevice] = {}
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
-        return anchor_of(x)
+        if x.device.type != "cpu":
+            return anchor_of(x)
+        return torch.from_numpy(network.anchor_of(x.numpy()))
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         told = () if self.command is None else (self.command(x, k),)

@@ -148,7 +148,7 @@ def stance_cost(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> Cost:
 
     def energy(x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
         power = x[:, 25:37] * go2.motor_torque(x[:, 7:19], x[:, 25:37], u)
-        return cfg.energy * power.norm(dim=1)
+        return cfg.energy * torch.linalg.vector_norm(power, dim=1)
 
     def pose(x: Tensor, *_: Tensor) -> Tensor:
         home = _targets(x.dtype, x.device)[2][STAND_TARGET]
