@@ -13,7 +13,7 @@ from torch import Tensor
 from hmc.modes import Mode
 from hmc.sim.base import Sim
 from hmc.sim.device import upload
-from hmc.sim.ids import Ids, count, where
+from hmc.sim.ids import Ids, count, fresh, where
 from hmc.start import Start
 from hmc.task import Task
 
@@ -90,16 +90,15 @@ class Worlds:
         if self.task.modes.constants is not None:
             held = upload(self.task.modes.constants.take(modes), self.sim.device).to(self.sim.dtype)
             return Crew(len(modes), [], held[:, None].expand(-1, self.sim.nu))
-        ids, parts, new = where(ids), [], modes != before
-        indices = np.flatnonzero(np.bincount(modes)).tolist()
+        new, count = modes != before, np.bincount(modes)
+        indices = count.nonzero()[0].tolist()
+        if len(indices) == 1:
+            return Crew(len(modes), [Part(self.task.modes[indices[0]], None, where(ids), self._where(new))])
+        parts, worlds = [], self._all[where(ids)]
         for index in indices:
-            if len(indices) == 1:
-                parts.append(Part(self.task.modes[index], slice(None), ids, self._where(new)))
-                continue
-            found = np.flatnonzero(modes == index)
+            found = (modes == index).nonzero()[0]
             rows, entered = upload(found, self.sim.device), self._where(new[found])
-            at = rows + (ids.start or 0) if isinstance(ids, slice) else ids[rows]
-            parts.append(Part(self.task.modes[index], rows, at, entered))
+            parts.append(Part(self.task.modes[index], rows, worlds.index_select(0, rows), entered))
         return Crew(len(modes), parts)
 
     def act(self, crew: Crew, x: Tensor, u: Tensor, k: int) -> Tensor:
@@ -116,16 +115,17 @@ class Worlds:
         """
         if crew.held is not None:
             return crew.held
-        if len(crew.parts) == 1:
-            return self._act(crew.parts[0], x, u, k)
-        action = u.new_empty(crew.size, self.sim.nu)
+        action = torch.empty_like(u)
         for part in crew.parts:
-            action[part.rows] = self._act(part, x[part.rows], u[part.rows], k)
+            if part.rows is None:
+                return self._act(part, x, u, k)
+            acted = self._act(part, x.index_select(0, part.rows), u.index_select(0, part.rows), k)
+            action.index_copy_(0, part.rows, acted)
         return action
 
     def _where(self, flags: Flags) -> Tensor | None:
         """Which are flagged, long; None for none of them."""
-        return upload(np.flatnonzero(flags), self.sim.device) if flags.any() else None
+        return upload(flags.nonzero()[0], self.sim.device) if flags.any() else None
 
     def _act(self, part: Part, x: Tensor, u: Tensor, k: int) -> Tensor:
         """Inputs of worlds that are all in one mode, (n, nu)."""
@@ -133,7 +133,7 @@ class Worlds:
         ks = torch.full((n,), k, device=x.device)
         if part.entered is not None:
             self._enter(part, x, u, ks)
-        memory = self.memory[part.at, :size]
+        memory = fresh(self.memory[:, :size], part.at)
         nested = mode.control_steps
         action, after = mode.act(x, u, memory, ks)
         self.nested_steps += mode.control_steps - nested
@@ -147,12 +147,12 @@ class Worlds:
         if self.task.modes.memory_size == 0:
             return
         assert new is not None
-        at = self._all[part.at][new]
-        self.memory[at] = 0.0
-        if (size := part.mode.memory_size) > 0:
-            start = part.mode.reset(x[new], u[new], k[new])
-            start = _shaped(part.mode, "reset() memory", start, (len(at), size))
-            self.memory[at, :size] = start.to(self.memory.dtype)
+        at, size = self._all[part.at].index_select(0, new), part.mode.memory_size
+        self.memory[:, size:].index_fill_(0, at, 0.0)
+        if size > 0:
+            start = part.mode.reset(x.index_select(0, new), u.index_select(0, new), k[: len(at)])
+            start = _shaped(part.mode, "reset() memory", start, (len(at), size)).to(self.memory.dtype)
+            self.memory[:, :size].index_copy_(0, at, start)
 
 
 @dataclass
@@ -161,13 +161,13 @@ class Part:
 
     Attributes:
         mode: that acts.
-        rows: which of the crew's n worlds they are.
+        rows: which of the crew's n worlds they are; None for all of them.
         at: and which of the simulator's.
         entered: which of them enter the mode at the next step; None for none of them.
     """
 
     mode: Mode
-    rows: Tensor | slice
+    rows: Tensor | None
     at: Tensor | slice
     entered: Tensor | None
 

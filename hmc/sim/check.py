@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,8 @@ def check(worlds: int, ids: Ids, **arrays: tuple[Tensor, int]) -> None:
     if isinstance(ids, Tensor):
         if ids.dtype != torch.long or ids.ndim != 1:
             raise ValueError(f"ids must be a long tensor (n,), got {ids.dtype} {tuple(ids.shape)}")
-        if n and ids.device.type == "cpu" and not (int(ids.min()) >= 0 and int(ids.max()) < worlds):
+        # as unsigned numbers, negative indices are too large as well
+        if n and ids.device.type == "cpu" and ids.numpy().view(np.uint64).max() >= worlds:
             raise ValueError(f"ids must be in [0, {worlds}), got {int(ids.min())} to {int(ids.max())}")
     for name, (array, width) in arrays.items():
         if array.shape != (n, width):

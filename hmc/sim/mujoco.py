@@ -14,6 +14,8 @@ from torch import Tensor
 from hmc.sim.check import check, check_latency
 from hmc.sim.ids import Ids, fresh, where
 
+_STATE = int(mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL)
+
 
 class MujocoSim:
     """W worlds of one MuJoCo model on `mujoco.batch.Batch`; see `hmc.sim.base.Sim`.
@@ -63,8 +65,7 @@ class MujocoSim:
         # a control step's stretches: after so many physics steps, the inputs that arrive then begin to act
         self._arrivals = sorted({0, *late})
         self._row = torch.from_numpy(self.batch.state)
-        self._qpos = torch.from_numpy(self.batch.bind("qpos"))
-        self._qvel = torch.from_numpy(self.batch.bind("qvel"))
+        self._x = self._row[:, 1 : 1 + self.nx]  # a row begins with time, qpos, qvel
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._force = self.batch.bind("actuator_force")  # filled by steps after the bind, so bind now
         self._fresh = self._row[0].clone()
@@ -95,7 +96,7 @@ class MujocoSim:
         return torch.float64
 
     def x(self, ids: Ids = None) -> Tensor:
-        return torch.cat([self._qpos[where(ids)], self._qvel[where(ids)]], dim=1)
+        return fresh(self._x, ids)
 
     def u(self, ids: Ids = None) -> Tensor:
         return fresh(self._ctrl, ids)
@@ -104,16 +105,13 @@ class MujocoSim:
         check(self.num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
         ids = where(ids)
         self._row[ids] = self._fresh
-        self._qpos[ids] = x[:, : self.model.nq].to(torch.float64)
-        self._qvel[ids] = x[:, self.model.nq :].to(torch.float64)
+        self._x[ids] = x.to(torch.float64)
         self._ctrl[ids] = u.to(torch.float64)
 
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
         # the engine takes indices in ascending order only
-        order = (
-            None if ids is None else self._each[ids] if isinstance(ids, slice) else ids.sort().values.numpy()
-        )
+        order = None if ids is None else self._each[ids] if isinstance(ids, slice) else np.sort(ids.numpy())
         if len(self._arrivals) == 1:
             self._ctrl[where(ids)] = u.to(torch.float64)
             self.batch.step(order, nstep=self._substeps)
@@ -135,11 +133,15 @@ class MujocoSim:
             held = torch.cat([self._ctrl[ids[order]][:, None], held], 1)
             seen = (1 + torch.arange(steps) - late[:, None]).clamp(min=0)
             held = held[torch.arange(len(held))[:, None], seen]
-        found = self.batch.rollout(steps, held.numpy(), record=("qpos", "qvel"), ids=ids[order].numpy())
-        x = torch.cat([torch.from_numpy(found[part]) for part in ("qpos", "qvel")], 2)
-        # a world that the engine gave up repeats its last state, although it moves there
-        stuck = (x[:, 1:] == x[:, :-1]).all(2) & (x[:, 1:, self.model.nq :] != 0).any(2)
-        x[:, 1:][stuck] = torch.nan
+        at = ids[order].numpy()
+        warned = self.batch.warning[at]
+        found = self.batch.rollout(steps, held.numpy(), record=(_STATE,), ids=at)
+        x = torch.from_numpy(found[_STATE])
+        # a world that the engine warned of and gave up repeats its last state, although it moves there
+        for row in np.flatnonzero((self.batch.warning[at] != warned).any((1, 2))):
+            states = x[row]
+            stuck = (states[1:] == states[:-1]).all(1) & (states[1:, self.model.nq :] != 0).any(1)
+            states[1:][stuck] = torch.nan
         if len(self._arrivals) > 1:
             self._ctrl[ids] = controls[:, -1].to(torch.float64)
         return x[order.argsort(), self._substeps - 1 :: self._substeps]
