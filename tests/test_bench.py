@@ -31,6 +31,7 @@ SMALL = {
             "policy_efficiency",
             "policy_steps_per_s",
             "evaluator_efficiency",
+            "evaluator_open_loop_efficiency",
         },
     ),
     "train": (

@@ -31,7 +31,8 @@ def main(args: Engine | Train | Planner | Wire | Growth | Gpu) -> int:
     """Measure, print, write."""
     threads = args.threads or cores()
     args = replace(args, threads=threads)
-    torch.set_num_threads(threads)
+    # searches run on one torch thread, see `plan`
+    torch.set_num_threads(1 if isinstance(args, Engine | Planner) else threads)
     torch.manual_seed(0)
     name = type(args).__name__.lower()
     host = machine(threads)

@@ -21,7 +21,7 @@ from hmc.go2.model import HOME, Q_LOWER, Q_UPPER, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.stances import HANDSTAND
 from hmc.go2.task import CostCfg, policy_path, stance_cost
-from hmc.modes import ModeSet
+from hmc.modes import ModeSet, Motion
 from hmc.rollout import roll
 from hmc.schedule import Schedule, SwitchSpace
 from hmc.sim.ids import Ids, where
@@ -150,7 +150,11 @@ def engine(args: Engine) -> Figures:
         policy = Policy(path, name="hand", threads=threads)
         words = "random policy" if path.name == "random.onnx" else path.name
         _policy_mode(figures, args, sim, bare, policy, words)
-        _evaluator(figures, args, sim, bare, policy, words)
+        other = Policy(path, name="other", threads=threads)
+        _evaluator(figures, args, sim, bare, "evaluator", ModeSet([policy, other]), words)
+    pose = HANDSTAND.pose.double()
+    played = [Motion(name, pose + 0.1 * torch.randn(args.steps, 12).double()) for name in ("hand", "other")]
+    _evaluator(figures, args, sim, bare, "evaluator_open_loop", ModeSet(played), "motions")
     return figures
 
 
@@ -183,12 +187,11 @@ def _policy_mode(
 
 
 def _evaluator(
-    figures: Figures, args: Engine, sim: MujocoSim, bare: Bare, policy: Policy, words: str
+    figures: Figures, args: Engine, sim: MujocoSim, bare: Bare, name: str, modes: ModeSet, words: str
 ) -> None:
     """The planner's rollouts of single switches, costs included, against the steps that they come to."""
     cost = stance_cost(CostCfg(), lambda k: k >= 0)
-    other = Policy(policy.network.path, name="other", threads=args.threads)
-    task = Task("hold", ModeSet([policy, other]), cost, args.steps, lambda n: sim)
+    task = Task("hold", modes, cost, args.steps, lambda n: sim)
     start = make_start(task, sim, HANDSTAND.state(), HANDSTAND.pose.double(), None, None, 0, None)
     space, worlds = SwitchSpace(2, args.steps), Worlds(task, sim)
     into_other = torch.arange(len(space) // 2, len(space))[: args.worlds]
@@ -218,6 +221,6 @@ def _evaluator(
 
     times = take_turns(rollouts, whole, args.repeats, args.clock)
     last = steps[-1][0]
-    same(sim.save().numpy()[last], bare.batch.state[last], "evaluator")
+    same(sim.save().numpy()[last], bare.batch.state[last], name)
     made = sum(len(ids) for ids, _, _ in steps) * SUBSTEPS
-    add_ratio(figures, "evaluator", times, made, f"{len(schedules)} schedules with costs, {words}")
+    add_ratio(figures, name, times, made, f"{len(schedules)} schedules with costs, {words}")

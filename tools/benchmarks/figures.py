@@ -18,6 +18,8 @@ from rich.table import Table
 AT_LEAST = {
     "open_loop_efficiency": 0.95,
     "policy_efficiency": 0.80,
+    "evaluator_efficiency": 0.80,
+    "evaluator_open_loop_efficiency": 0.90,
     "train_steps_per_s": 6000.0,
     "env_4096_efficiency": 0.80,
     "env_8192_efficiency": 0.80,
@@ -46,7 +48,7 @@ class Common:
 
     Attributes:
         json: file to write the figures to.
-        threads: of the engine, of torch and of onnxruntime; 0 for all cores.
+        threads: of the engine, of onnxruntime and, in training, of torch; 0 for all cores.
     """
 
     json: Path | None = None
