@@ -119,9 +119,8 @@ class _Rollout:
         self.slack = 1e-9 * abs(self.limit)  # more than rounding can make of partial cost and lower bound
         self.path = tree.path(0) if watched else []
         self.kept = np.array(sorted({branch for branch in self.path if branch >= 0}), dtype=np.int64)
-        self.recorder = (
-            Recorder(trunk, None if n <= RECORDED else self.path) if watched or n <= RECORDED else None
-        )
+        few = n <= RECORDED
+        self.recorder = Recorder(trunk, None if few else self.path) if few or watched else None
         self.terms = np.full((len(task.cost.names), n * self.members), math.nan)  # of those that arrived
         self.result = np.full(n, math.inf)
         self.pruned, self.barred = np.zeros((2, n), dtype=bool)
@@ -135,18 +134,20 @@ class _Rollout:
         self.births: list[tuple[int, slice, Indices]] = []
         # what cannot end a branch on the way is looked at now and then only
         watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
-        unlimited = self.cheap and self.limit == math.inf
-        self.at_once = 1 if watchful else self.horizon if unlimited else STEPS
         # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost
         self.later = far(self.sim.device) and not watchful and self.stages > 0
         self.constant = task.modes.constants is not None
         self.rows = CHEAP_ROWS if self.cheap else ROWS
+        # what steps cost can wait where nothing is given up for it
+        patient = self.limit == math.inf and not self.later
+        self.at_once = 1 if watchful else self.rows if patient else STEPS
+        self.before_births = not (self.cheap or patient)  # what is beyond its limit has no children
 
     def advance(self, i: int) -> None:
         """Step i of all branches that go on: what is born then, and their end at i = T, included."""
         sim, k, born = self.sim, self.first + i, self.tree.born
         if i == self.horizon or born[i + 1] > born[i]:
-            if i == self.horizon or not self.cheap:  # what is beyond its limit has no children
+            if i == self.horizon or self.before_births:
                 self._price(k)
             self._grow(i)
         if self.size == 0:

@@ -13,7 +13,7 @@ from torch import Tensor
 from hmc.modes import Mode
 from hmc.sim.base import Sim
 from hmc.sim.device import upload
-from hmc.sim.ids import Ids, count, fresh, where
+from hmc.sim.ids import Ids, count, where
 from hmc.start import Start
 from hmc.task import Task
 
@@ -133,7 +133,8 @@ class Worlds:
         ks = torch.full((n,), k, device=x.device)
         if part.entered is not None:
             self._enter(part, x, u, ks)
-        memory = fresh(self.memory[:, :size], part.at)
+        memory = self.memory[:, :size]
+        memory = memory[part.at] if isinstance(part.at, slice) else memory.index_select(0, part.at)
         nested = mode.control_steps
         action, after = mode.act(x, u, memory, ks)
         self.nested_steps += mode.control_steps - nested

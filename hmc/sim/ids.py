@@ -37,7 +37,9 @@ def fresh(buffer: Tensor, ids: Ids, dim: int = 0) -> Tensor:
     """A copy of what `buffer` holds for worlds `ids`, which it has along `dim`, 0 or 1."""
     if isinstance(ids, Tensor):
         return buffer.index_select(dim, ids)
-    return (buffer[where(ids)] if dim == 0 else buffer[:, where(ids)]).clone()
+    if ids is None:
+        return buffer.clone()
+    return (buffer[ids] if dim == 0 else buffer[:, ids]).clone()
 
 
 def joined(parts: Sequence[Tensor]) -> Tensor:

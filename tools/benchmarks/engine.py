@@ -205,11 +205,12 @@ def _evaluator(
         step(u, ids)
 
     sim.step = keep  # type: ignore[method-assign]
-    roll(worlds, trunk, schedules)
+    limit = 1e9  # nothing exceeds it, but as in a search it is looked at before branches are born
+    roll(worlds, trunk, schedules, limit)
     del sim.step
 
     def rollouts() -> Iterator[None]:
-        roll(worlds, trunk, schedules)
+        roll(worlds, trunk, schedules, limit)
         yield
 
     def whole() -> Iterator[None]:
