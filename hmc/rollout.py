@@ -158,7 +158,7 @@ class _Rollout:
         look = i == self.horizon or not self.later
         if look and not math.isfinite(float(x.sum())):  # a finite sum has finite parts
             x, u_prev = self._price(k, x, u_prev)
-            x, u_prev = self._drop(~self._all(_flags(finite(x))), x, u_prev)
+            x, u_prev = self._drop(~self._all(finite(x).cpu().numpy()), x, u_prev)
         if i == self.horizon:
             self._arrive(x, k)
             return
@@ -173,7 +173,7 @@ class _Rollout:
         self.unpriced.append((self.ids, x, u, u_prev))
         fine = self.later or self.crew.held is not None or math.isfinite(float(u.sum()))
         if not fine or len(self.unpriced) >= min(self.at_once, self.rows // self.size // self.members):
-            (u,) = self._price(k + 1, u, sane=None if fine else self._all(_flags(finite(u))))
+            (u,) = self._price(k + 1, u, sane=None if fine else self._all(finite(u).cpu().numpy()))
         if self.size > 0:
             sim.step(u, self._at)
             self.worlds.own_steps += self.size * self.members
@@ -389,8 +389,3 @@ class _Rollout:
 def far(device: torch.device) -> bool:
     """Whether to look at a number on a device is to wait for all that it was told to do before."""
     return device.type != "cpu"
-
-
-def _flags(values: Tensor) -> Flags:
-    flags: Flags = values.cpu().numpy()
-    return flags
