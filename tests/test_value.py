@@ -49,6 +49,21 @@ def test_the_file_is_the_critic(checkpoint):
         assert torch.equal(value(x[:n]), whole[:n]), "the same bits in a batch of any size"
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("name", STANCES)
+def test_on_a_device_it_is_worth_as_much(name):
+    """By torch, as on a GPU: what onnxruntime makes of the file within 1e-5, near the stance and far off."""
+    value, x = Value(policy_path(f"{name}_value")), STANCES[name].state().repeat(200, 1)
+    x[:100] += 0.05 * torch.randn(100, 37).double()
+    x[100:] += torch.randn(100, 37).double()
+    x[:, 3:7] /= x[:, 3:7].norm(dim=1, keepdim=True)
+    q = x[:, 7:19]
+    obs = seen(observe(x, q, anchor_of(x)), go2.motor_torque(q, x[:, 25:], q), x[:, 2]).float()
+    expected, found = value(x), value.on_device(obs)[:, 0].double() / value.rest
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    assert not torch.equal(found, expected), "another way to the same"
+
+
 def test_what_training_shows_the_critic_is_what_the_value_sees():
     env = make_env()
     torque = go2.motor_torque(env._x[:, 7:19], env._x[:, 25:37], env._u)

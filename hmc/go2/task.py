@@ -174,6 +174,8 @@ def with_values(cost: Cost, weight: float, hand: Callable[[Tensor], Tensor], thr
 
     def value(x: Tensor, k: Tensor) -> Tensor:
         target = hand(k)
+        if x.device.type != "cpu":  # to count the rows of each is to wait for a GPU
+            return weight * (1.0 - torch.where(target, other(x), foot(x))).clamp(min=0.0)
         lack = torch.zeros(len(x), dtype=x.dtype, device=x.device)
         for worth, rows in ((foot, (~target).nonzero()[:, 0]), (other, target.nonzero()[:, 0])):
             if len(rows):

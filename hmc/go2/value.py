@@ -1,4 +1,7 @@
-"""What it is worth to be in a state under a learned mode: its critic, for costs at the end of a horizon."""
+"""What it is worth to be in a state under a learned mode: its critic, for costs at the end of a horizon.
+
+By onnxruntime or, on a GPU, by torch.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from hmc.go2.model import motor_torque
 from hmc.go2.network import opened
 from hmc.go2.observe import anchor_of, observe
 from hmc.go2.stances import HOLDS
+from hmc.go2.torch_network import TorchNetwork
 
 VALUE_EXTRA = 13  # what a critic sees after the observation: joint torques and the base's height
 
@@ -46,16 +50,27 @@ class Value:
     """
 
     def __init__(self, path: str | Path, threads: int = 1):
-        self._session, self.metadata = opened(Path(path), threads)
+        self._path = Path(path)
+        self._session, self.metadata = opened(self._path, threads)
         if not self.metadata.get("value"):
             raise ValueError(f"value {path}: it is a policy: export its value with train/export.py --value")
         self.mode = str(self.metadata["mode"])
+        self._devices: dict[torch.device, TorchNetwork] = {}
         self.rest = 1.0
         self.rest = float(self(HOLDS[self.mode].state()[None])[0])
 
     def __call__(self, x: Tensor) -> Tensor:
         """Values of states x (n, 37), (n,)."""
         q = x[:, 7:19]
-        obs = seen(observe(x, q, anchor_of(x)), motor_torque(q, x[:, 25:37], q), x[:, 2])
-        (output,) = self._session.run(None, {"obs": obs.float().cpu().numpy()})
+        obs = seen(observe(x, q, anchor_of(x)), motor_torque(q, x[:, 25:37], q), x[:, 2]).float()
+        if x.device.type != "cpu":
+            return self.on_device(obs)[:, 0].to(x) / self.rest
+        (output,) = self._session.run(None, {"obs": obs.numpy()})
         return torch.from_numpy(output[:, 0]).to(x) / self.rest
+
+    def on_device(self, obs: Tensor) -> Tensor:
+        """The critic's output (n, 1) for what it sees (n, c + 13) float32, without leaving its device."""
+        if obs.device not in self._devices:
+            with torch.inference_mode(False):
+                self._devices[obs.device] = TorchNetwork(self._path, obs.device)
+        return self._devices[obs.device](obs)
