@@ -300,9 +300,10 @@ def test_cells_open_next_to_mastered_ones():
 
 def test_reports_move_the_right_entries():
     starts = Starts(HANDSTAND, StartsCfg(way=0.5), CPU)
-    cell = torch.tensor([5, 5, 12, 5, 3])
-    kind = torch.tensor([WAY, WAY, WAY, STANCE, STANCE])
-    starts.report(kind, cell, torch.tensor([True, False, True, True, True]))
+    cell = torch.tensor([5, 5, 12, 5, 3, 12, 9999])
+    kind = torch.tensor([WAY, WAY, WAY, STANCE, STANCE, WAY, WAY])
+    ended = torch.tensor([True] * 5 + [False] * 2)
+    starts.report(kind, cell, torch.tensor([True, False, True, True, True, True, True]), ended)
     expected = torch.zeros(starts.places * starts.ENERGIES)
     expected[5] = (1 - 0.95**2) * 0.5
     expected[12] = 1 - 0.95

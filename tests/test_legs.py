@@ -209,8 +209,9 @@ def test_starts(monkeypatch):
     nose = go2.vertical(start.x[start.kind == STANCES][:, 3:7])[:, 0]
     assert (nose.abs() > 0.95).all()
     assert 0.4 < (nose > 0).float().mean() < 0.6, "as many nose up as nose down"
-    starts.report(torch.tensor([1, 1, 0]), torch.zeros(3).long(), torch.tensor([True, True, False]))
-    assert starts.rates[1] == pytest.approx(1 - 0.995**2)
+    good, ended = torch.tensor([True, True, False, True]), torch.tensor([True, True, True, False])
+    starts.report(torch.tensor([1, 1, 0, 2]), torch.zeros(4).long(), good, ended)
+    assert starts.rates[1] == pytest.approx(1 - 0.995**2, rel=1e-4)
     assert starts.rates[0] == 0.0
 
 

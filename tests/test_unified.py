@@ -72,7 +72,9 @@ def test_each_stance_learns_from_its_own_episodes():
     cfg = UnifiedCfg("unified", footstand=STARTS, handstand=STARTS)
     starts = UnifiedStarts(cfg, CPU)
     kinds = torch.tensor([WAY, HAND + WAY, HAND + STANCE, FLIP])
-    starts.report(kinds, torch.tensor([3, 5, 0, 0]), torch.tensor([True, False, True, True]))
+    starts.report(
+        kinds, torch.tensor([3, 5, 0, 0]), torch.tensor([True, False, True, True]), torch.ones(4).bool()
+    )
     foot, hand = starts.stances
     assert foot.success.flatten()[3] == pytest.approx(0.05)
     assert not hand.success.any()

@@ -21,8 +21,11 @@ from hmc.go2.observe import anchor_of, observe
 from hmc.go2.stances import Stance, Stand
 from hmc.go2.value import seen
 from hmc.sim.base import Sim
+from train.chosen import Chosen, choose, pick, put, reset
 
 Gap = dict[str, Tensor]
+
+AHEAD = 8  # control steps that one draw of starts for all worlds serves: it takes as long as several of them
 
 
 @dataclass(frozen=True)
@@ -76,11 +79,11 @@ class StartStates(Protocol):
         """The next n starts."""
         ...
 
-    def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
-        """Learn from ended episodes: their kind, cell and whether they were a success, all (n,)."""
+    def report(self, kind: Tensor, cell: Tensor, success: Tensor, ended: Tensor) -> None:
+        """Learn from episodes that `ended`: kind, cell and whether they were a success, all (n,)."""
         ...
 
-    def log(self) -> dict[str, float]:
+    def log(self) -> dict[str, Tensor]:
         """What else is to be shown of it, by name."""
         ...
 
@@ -144,7 +147,9 @@ class Go2Env(VecEnv):
         self._cell = torch.zeros_like(self._kind)
         self._x = torch.zeros(self.num_envs, sim.nx, device=self.device)
         self._u = torch.zeros(self.num_envs, 12, device=self.device)
-        self._reset(torch.arange(self.num_envs, device=self.device))
+        self._ahead: Start | None = None
+        self._resets = 0
+        self._reset(choose(torch.ones(self.num_envs, dtype=torch.bool, device=self.device)))
 
     @abstractmethod
     def rewards(self, x: Tensor, before: Tensor, u: Tensor, u_prev: Tensor, gap: Gap) -> dict[str, Tensor]:
@@ -202,11 +207,11 @@ class Go2Env(VecEnv):
         }
         if self.cfg.conditions.push > 0:
             self._push(self.good(x, gap) & ~done)
-        ids = done.nonzero().squeeze(1)
-        if len(ids):
-            self.starts.report(self._kind[ids], self._cell[ids], (timeout & self.good(x, gap))[ids])
-            log["/episode/length"] = self.episode_length_buf[ids].float().mean()
-            self._reset(ids)
+        ended = choose(done)
+        if len(ended):
+            self.starts.report(self._kind, self._cell, timeout & self.good(x, gap), done)
+            log["/episode/length"] = (self.episode_length_buf * done).sum() / done.sum()  # NaN: none ended
+            self._reset(ended)
         for kind in self._drawn:
             log[f"/success/{self.starts.kinds[kind]}"] = self.starts.rates[kind]
         log |= {f"/success/{name}": value for name, value in self.starts.log().items()}
@@ -220,25 +225,39 @@ class Go2Env(VecEnv):
     def _push(self, standing: Tensor) -> None:
         """Push some of the worlds that are `standing`, (n,) bool."""
         conditions = self.cfg.conditions
-        chosen = torch.rand(self.num_envs, device=self.device) < self.sim.dt / conditions.push_every
-        ids = (standing & chosen).nonzero().squeeze(1)
-        if len(ids):
-            speed, direction = torch.rand(2, len(ids), device=self.device)
-            x = pushed(self._x[ids], conditions.push * speed, 2 * math.pi * direction)
-            self.sim.reset(x, (self._u - self._zeros)[ids], ids)
-            self._x = self._x.index_copy(0, ids, x)
+        hit = torch.rand(self.num_envs, device=self.device) < self.sim.dt / conditions.push_every
+        chosen = choose(standing & hit)
+        if len(chosen):
+            speed, direction = torch.rand(2, len(chosen), device=self.device)
+            x = pushed(pick(self._x, chosen), conditions.push * speed, 2 * math.pi * direction)
+            reset(self.sim, chosen, x, pick(self._u - self._zeros, chosen))
+            self._x = self._x.clone()
+            put(self._x, chosen, x)
 
-    def _reset(self, ids: Tensor) -> None:
-        start = self.starts.draw(len(ids))
-        self.sim.reset(start.x, start.u, ids)
+    def _reset(self, chosen: Chosen) -> None:
+        start = self._starts_of(chosen)
+        reset(self.sim, chosen, start.x, start.u)
         self._x, self._u, self._anchor = self._x.clone(), self._u.clone(), self._anchor.clone()
-        self._x[ids], self._u[ids] = start.x, start.u + self._zeros[ids]
-        self._anchor[ids] = anchor_of(start.x)
-        self._anchor[ids, :2] += 0.6 * torch.rand(len(ids), 2, device=self.device) - 0.3
-        self._kind[ids], self._cell[ids] = start.kind, start.cell
+        put(self._x, chosen, start.x)
+        put(self._u, chosen, start.u + pick(self._zeros, chosen))
+        anchor = anchor_of(start.x)
+        anchor[:, :2] += 0.6 * torch.rand(len(chosen), 2, device=self.device) - 0.3
+        put(self._anchor, chosen, anchor)
+        put(self._kind, chosen, start.kind)
+        put(self._cell, chosen, start.cell)
         width = self.cfg.conditions.noise.lasting * self._widths
-        self._lasting[ids] = (2 * torch.rand(len(ids), len(width), device=self.device) - 1) * width
-        self.episode_length_buf[ids] = 0
+        put(self._lasting, chosen, (2 * torch.rand(len(chosen), len(width), device=self.device) - 1) * width)
+        put(self.episode_length_buf, chosen, 0)
+
+    def _starts_of(self, chosen: Chosen) -> Start:
+        """A start for each of the chosen worlds. Under flags each world has one for some steps, and begins
+        there again if it ends twice in them."""
+        if chosen.dtype != torch.bool:
+            return self.starts.draw(len(chosen))
+        if self._ahead is None or self._resets % AHEAD == 0:
+            self._ahead = self.starts.draw(self.num_envs)
+        self._resets += 1
+        return self._ahead
 
 
 def both_sides(

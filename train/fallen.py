@@ -9,12 +9,16 @@ from torch import Tensor
 
 from hmc.go2 import model as go2
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STAND
+from hmc.sim.device import constant
 from hmc.sim.mujoco import MujocoSim
+from train.chosen import choose, put
 from train.env import Start
+from train.starts import average
 
 STANDING, FALLEN, STANCES = range(3)
 SETTLE = 60  # control steps in which a dropped robot comes to rest
 ROLL = 5.0  # rad/s, at most, with which it is dropped
+LEVEL = torch.tensor([1.0, 1.0, 0.0])  # axes about which a robot is tilted
 
 
 @dataclass(frozen=True)
@@ -68,19 +72,17 @@ class LegsStarts:
         x = disturbed(self._rest[which], self.cfg)
         u = x[:, 7:19].clone()
         if self._fallen is not None:
-            lying = (kind == FALLEN).nonzero().squeeze(1)
+            lying = choose(kind == FALLEN)
             picked = self._fallen[torch.randint(len(self._fallen), (len(lying),), device=self.device)]
-            x[lying], u[lying] = picked[:, :37], picked[:, 37:]
+            put(x, lying, picked[:, :37])
+            put(u, lying, picked[:, 37:])
         return Start(x, u, kind, torch.zeros_like(kind))
 
-    def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
+    def report(self, kind: Tensor, cell: Tensor, success: Tensor, ended: Tensor) -> None:
         """Average of the successes of each kind lately."""
-        for each in kind.unique().tolist():
-            rate = success[kind == each].float().mean()
-            keep = 0.995 ** int((kind == each).sum())
-            self.rates[each] = keep * self.rates[each] + (1 - keep) * rate
+        average(self.rates, kind, success, ended, 0.995)
 
-    def log(self) -> dict[str, float]:
+    def log(self) -> dict[str, Tensor]:
         """Nothing but the rates."""
         return {}
 
@@ -100,10 +102,11 @@ def disturbed(x: Tensor, cfg: LegsStartsCfg) -> Tensor:
         return 2 * torch.rand(shape, device=x.device) - 1
 
     n, x = len(x), x.clone()
-    tilt = 0.5 * cfg.tilt * uniform(n, 3) * x.new_tensor([1.0, 1.0, 0.0])
+    tilt = 0.5 * cfg.tilt * uniform(n, 3) * constant(LEVEL, x)
     turn = torch.cat([x.new_ones(n, 1), tilt], 1)
     x[:, 3:7] = go2.product(x[:, 3:7], turn / turn.norm(dim=1, keepdim=True))
-    x[:, 7:19] = (x[:, 7:19] + cfg.joints * uniform(n, 12)).clamp(go2.Q_LOWER.to(x), go2.Q_UPPER.to(x))
+    low, high = constant(go2.Q_LOWER, x), constant(go2.Q_UPPER, x)
+    x[:, 7:19] = (x[:, 7:19] + cfg.joints * uniform(n, 12)).clamp(low, high)
     x[:, 19:25] += cfg.speed * uniform(n, 6)
     x[:, 25:37] += cfg.speed * uniform(n, 12)
     x[:, 2] += 0.001 - go2.lowest(x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Literal
 
 import torch
@@ -12,6 +13,8 @@ from hmc.go2 import model as go2
 from hmc.go2.observe import anchor_of
 from hmc.go2.stances import STAND
 from hmc.sim.base import Sim
+from hmc.sim.device import constant
+from train.chosen import Chosen, choose, put
 from train.env import EnvCfg, Gap, Go2Env
 from train.fallen import LegsStarts, LegsStartsCfg
 from train.rewards import LegsRewardCfg, legs_rewards
@@ -99,7 +102,7 @@ class LegsEnv(Go2Env):
         )
         if self._walks:
             new = torch.rand(self.num_envs, device=self.device) < self.sim.dt / self.cfg.command.every
-            self._command(new.nonzero().squeeze(1))
+            self._command(choose(new))
         return terms
 
     def fallen(self, x: Tensor, gap: Gap) -> Tensor:
@@ -112,28 +115,37 @@ class LegsEnv(Go2Env):
             return self._astray < ASTRAY * self._since.clamp(min=1)
         return STAND.held(x, gap) & (x[:, 19:22].norm(dim=1) < STILL)
 
-    def _reset(self, ids: Tensor) -> None:
-        super()._reset(ids)
-        self._air[ids] = 0.0
+    def _reset(self, chosen: Chosen) -> None:
+        super()._reset(chosen)
+        put(self._air, chosen, 0.0)
         if self._walks:
-            self._command(ids)
-        self._since[ids], self._astray[ids] = 0.0, 0.0
+            self._command(chosen)
+        put(self._since, chosen, 0.0)
+        put(self._astray, chosen, 0.0)
 
-    def _command(self, ids: Tensor) -> None:
-        """Command worlds `ids` anew."""
-        if len(ids) == 0:
+    def _command(self, chosen: Chosen) -> None:
+        """Command the chosen worlds anew."""
+        if len(chosen) == 0:
             return
-        self.command = self.command.index_copy(0, ids, drawn(self.cfg.command, len(ids), self.device))
-        self._since[ids], self._astray[ids] = 0.0, 0.0
+        self.command = self.command.clone()
+        put(self.command, chosen, drawn(self.cfg.command, len(chosen), self.device))
+        put(self._since, chosen, 0.0)
+        put(self._astray, chosen, 0.0)
 
 
 def drawn(cfg: CommandCfg, n: int, device: torch.device) -> Tensor:
     """n commands: forward, sideways [m/s], turn [rad/s], (n, 3)."""
     share = torch.rand(n, 3, device=device)
-    low = share.new_tensor([cfg.forward[0], -cfg.sideways, -cfg.turn])
-    high = share.new_tensor([cfg.forward[1], cfg.sideways, cfg.turn])
+    low, high = (constant(each, share) for each in _limits(cfg))
     moves = torch.rand(n, 1, device=device) >= cfg.halt
     return (low + (high - low) * share) * moves
+
+
+@cache
+def _limits(cfg: CommandCfg) -> tuple[Tensor, Tensor]:
+    """Lowest and highest command, (3,) each."""
+    low = torch.tensor([cfg.forward[0], -cfg.sideways, -cfg.turn])
+    return low, torch.tensor([cfg.forward[1], cfg.sideways, cfg.turn])
 
 
 def heading_velocity(x: Tensor) -> Tensor:

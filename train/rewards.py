@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hmc.go2 import model as go2
 from hmc.go2.stances import Stance
+from hmc.sim.device import constant
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def stage_rewards(
     height = torch.exp(-(TARGET_HEIGHT - x[:, 2]).clamp(min=0) / 0.1)
     orientation = (0.5 * stance.uprightness(x) + 0.5).square()
     still = torch.exp(-(x[:, 19:22] / cfg.pace).square().sum(1) - 0.1 * x[:, 22:25].square().sum(1))
-    off = (q - stance.pose.to(q)).square().reshape(-1, 2, 6).sum(2)  # of the front and the rear pair
+    off = (q - constant(stance.pose, q)).square().reshape(-1, 2, 6).sum(2)  # of the front and the rear pair
     torque = go2.motor_torque(q, qd, u)
     return {
         "height": cfg.height * height,
@@ -118,7 +119,7 @@ def efforts(
     """What moving costs in every mode, name -> (n,); arguments as of `stage_rewards`, torque (n, 12)."""
     q, qd = x[:, 7:19], x[:, 25:37]
     return {
-        "limits": -cfg.limits * ((q - MIDDLE.to(q)).abs() - REACH.to(q)).clamp(min=0).sum(1),
+        "limits": -cfg.limits * ((q - constant(MIDDLE, q)).abs() - constant(REACH, q)).clamp(min=0).sum(1),
         "power": -cfg.power * (torque * qd).abs().sum(1),
         "acceleration": -cfg.acceleration * ((qd - before[:, 25:37]) / dt).square().sum(1),
         "target_rate": -cfg.target_rate * (u - u_prev).square().sum(1),
@@ -192,15 +193,14 @@ def legs_rewards(
     moves = command.norm(dim=1) > 0.1
     still = high * torch.exp(-x[:, 19:22].square().sum(1) - 0.1 * x[:, 22:25].square().sum(1))
     air = (landed.clamp(max=0.35) - 0.1).clamp(min=0).sum(1) / dt
-    down = gap["foot"] < 0.005
-    one, other = down[:, [0, 3]], down[:, [1, 2]]
-    trot = (one.all(1) & ~other.any(1)) | (other.all(1) & ~one.any(1))
+    left, right, rear_left, rear_right = (gap["foot"] < 0.005).unbind(1)
+    trot = (left & rear_right & ~(right | rear_left)) | (right & rear_left & ~(left | rear_right))
     torque = go2.motor_torque(q, qd, u)
     touching = (gap["thigh"] < 0).sum(1) + (gap["calf"] < 0).sum(1) + (gap["trunk"] < 0)
     terms = {
         "upright": cfg.upright * upright,
         "height": cfg.height * high,
-        "posture": cfg.posture * high * torch.exp(-0.5 * (q - go2.HOME.to(q)).square().sum(1)),
+        "posture": cfg.posture * high * torch.exp(-0.5 * (q - constant(go2.HOME, q)).square().sum(1)),
         "stillness": cfg.stillness * torch.where(moves, 0.0, still),
         "track": cfg.track * high * torch.exp(-off[:, :2].square().sum(1) / 0.15),
         "turn": cfg.turn * high * torch.exp(-off[:, 2].square() / 0.25),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 import random
 import shutil
 import time
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rsl_rl.runners import OnPolicyRunner
+from torch import Tensor
 
 from hmc.sim.check import tell_overflow
 from train.env import Go2Env
@@ -27,6 +28,8 @@ CHECKPOINT_KEYS = ("actor_state_dict", "critic_state_dict", "optimizer_state_dic
 
 class Runner(OnPolicyRunner):
     """`OnPolicyRunner` for one `Go2Env`.
+
+    What rsl-rl's logger reads of a GPU at every step, and waits for, is read once an iteration here.
 
     A checkpoint also holds the random state, the start-state curriculum and the number of environment
     steps, and is written to a temporary file that replaces the old one only when it is complete.
@@ -52,6 +55,8 @@ class Runner(OnPolicyRunner):
         self.table = LiveTable(self)
         self._log = self.logger.log
         self.logger.log = self._log_quietly
+        self.logger.process_env_step = self._take_down
+        self._ended: list[Tensor] = []  # of each step: which episodes ended, returns, lengths, (3, worlds)
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
         if self.logger.disable_logs:  # another process of torchrun writes
@@ -132,13 +137,35 @@ class Runner(OnPolicyRunner):
         for group in self.alg.optimizer.param_groups:
             group["fused"] = True
 
+    def _take_down(self, rewards: Tensor, dones: Tensor, extras: dict[str, Any], *_: Any) -> None:
+        """What the logger keeps of a step."""
+        log = self.logger
+        if log.writer is None:
+            return
+        log.ep_extras.append(extras["log"])
+        log.cur_reward_sum += rewards
+        log.cur_episode_length += 1
+        self._ended.append(torch.stack([dones.float(), log.cur_reward_sum, log.cur_episode_length]))
+        for running in (log.cur_reward_sum, log.cur_episode_length):
+            running.masked_fill_(dones > 0, 0.0)
+
+    def _read_off(self) -> None:
+        """Give the logger the iteration's episodes, and of its entries the means."""
+        log = self.logger
+        ended, returns, lengths = torch.stack(self._ended, 1).cpu()
+        log.rewbuffer.extend(returns[ended > 0].tolist())
+        log.lenbuffer.extend(lengths[ended > 0].tolist())
+        log.ep_extras = [means(log.ep_extras)]
+        self._ended.clear()
+
     def _log_quietly(self, **kwargs: Any) -> None:
         self.updates += 1
         self.set_learning_rate(kwargs["it"] + 1)
         tell_overflow(self.env.sim)
         if self.logger.disable_logs:
             return
-        self.table.update(kwargs, self.logger.ep_extras)
+        self._read_off()
+        self.table.update(kwargs, self.logger.ep_extras[0])
         with contextlib.redirect_stdout(io.StringIO()):
             self._log(**kwargs)
 
@@ -167,6 +194,14 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return data
 
 
+def means(entries: list[dict[str, Tensor]]) -> dict[str, float]:
+    """The mean of each number () over the steps in which it is one, of those that ever are."""
+    names = dict.fromkeys(name for entry in entries for name in entry)
+    columns = [torch.stack([entry[name] for entry in entries if name in entry]) for name in names]
+    found = torch.stack([column.float().nanmean() for column in columns]).tolist()
+    return {name: mean for name, mean in zip(names, found, strict=True) if math.isfinite(mean)}
+
+
 class LiveTable:
     """Progress on a terminal as one table that updates itself, elsewhere as a line now and then."""
 
@@ -177,13 +212,8 @@ class LiveTable:
         self.live = Live(console=self.console, refresh_per_second=2) if shown else None
         self.printed = 0.0
 
-    def update(self, log: dict[str, Any], extras: list[dict[str, Any]]) -> None:
-        """Show one iteration: what the runner logs and the environment's own log entries."""
-        sums: dict[str, list[float]] = defaultdict(list)
-        for entry in extras:
-            for key, value in entry.items():
-                sums[key].append(float(value.mean() if isinstance(value, torch.Tensor) else value))
-        means = {key: sum(values) / len(values) for key, values in sums.items()}
+    def update(self, log: dict[str, Any], means: dict[str, float]) -> None:
+        """Show one iteration: what the runner logs and the means of the environment's own log entries."""
         size = (
             self.runner.cfg["num_steps_per_env"]
             * self.runner.env.num_envs

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from hmc.go2 import model as go2
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, Stance
+from hmc.sim.device import constant
+from train.chosen import choose, put
 from train.env import Start
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -105,22 +107,21 @@ class Starts:
         cell = torch.multinomial(self.weights().flatten(), n, replacement=True)
         column = torch.div(cell, self.ENERGIES, rounding_mode="floor")
         on_way = kind == WAY
-        place[on_way] = (1.0 - (column + self._uniform(n, 0, 1)) * self.WIDTH)[on_way]
+        place = torch.where(on_way, 1.0 - (column + self._uniform(n, 0, 1)) * self.WIDTH, place)
         width = (self.ENERGY_HIGH - self.ENERGY_LOW) / self.ENERGIES
-        energy[on_way] = (self.ENERGY_LOW + (cell % self.ENERGIES + self._uniform(n, 0, 1)) * width)[on_way]
-        place[kind == HOME] = 0.0
+        share = self.ENERGY_LOW + (cell % self.ENERGIES + self._uniform(n, 0, 1)) * width
+        energy = torch.where(on_way, share, energy)
+        place = torch.where(kind == HOME, 0.0, place)
         x = self._place(place, energy, hop=on_way & (self._uniform(n, 0, 1) < 0.5))
-        u = (x[:, 7:19] + self._uniform((n, 12), -0.3, 0.3)).clamp(
-            go2.Q_LOWER.to(self.device), go2.Q_UPPER.to(self.device)
-        )
+        u = within(x[:, 7:19] + self._uniform((n, 12), -0.3, 0.3))
         if self.records is not None:
-            recorded = (kind == RECORDED).nonzero().squeeze(1)
+            recorded = choose(kind == RECORDED)
             many = len(self.records["x"])
             pick = torch.randint(many, (len(recorded),), device=self.device)
             if self.unlocked and len(recorded) <= many:
                 pick = torch.arange(len(recorded), device=self.device)
-            x[recorded] = self.records["x"][pick].to(x)
-            u[recorded] = self.records["u"][pick].to(u)
+            put(x, recorded, self.records["x"][pick].to(x))
+            put(u, recorded, self.records["u"][pick].to(u))
         return Start(x, u, kind, cell)
 
     def weights(self) -> Tensor:
@@ -137,25 +138,25 @@ class Starts:
 
         Their early episodes are long and teach nothing; they would be most of a batch.
         """
-        held = bool(self.rates[STANCE] > 0.5)
-        near = self.cfg.way == 0 or self.frontier() <= self.HORIZONTAL
-        ready = self.shares.new_tensor([True, True, held and near, held])
-        return self.shares if self.unlocked else self.shares * ready
+        if self.unlocked:
+            return self.shares
+        held, ready = self.rates[STANCE] > 0.5, torch.ones_like(self.shares)
+        ready[RECORDED] = held
+        ready[HOME] = held & (self.frontier() <= self.HORIZONTAL) if self.cfg.way > 0 else held
+        return self.shares * ready
 
-    def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
-        """Learn from ended episodes: their kind, cell and whether they ended standing, all (n,)."""
-        success = success.float()
-        way = kind == WAY
-        _average(self.success.view(-1), cell[way], success[way], 0.95)
-        _average(self.rates, kind, success, 0.995)
+    def report(self, kind: Tensor, cell: Tensor, success: Tensor, ended: Tensor) -> None:
+        """Learn from episodes that `ended`: kind, cell and whether they ended standing, all (n,)."""
+        average(self.success.view(-1), cell, success, ended & (kind == WAY), 0.95)
+        average(self.rates, kind, success, ended, 0.995)
 
-    def frontier(self) -> float:
-        """Furthest place from which some energy succeeds in more than a third of the episodes."""
-        good = (self.success > 0.35).any(1).nonzero()
-        rows = int(good.max()) + 1 if len(good) else 0
-        return 1.0 - rows * self.WIDTH
+    def frontier(self) -> Tensor:
+        """Furthest place from which some energy succeeds in more than a third of the episodes, ()."""
+        good = (self.success > 0.35).any(1)
+        rows = (good * torch.arange(1, self.places + 1, device=self.device)).amax()
+        return 1.0 - rows.double() * self.WIDTH
 
-    def log(self) -> dict[str, float]:
+    def log(self) -> dict[str, Tensor]:
         """How far the way is open."""
         return {"frontier": self.frontier()}
 
@@ -182,13 +183,10 @@ class Starts:
         """
         n, cfg, stance = len(place), self.cfg, self.stance
         wobble = (0.4 + 0.6 * (energy == 0)) * cfg.tilt
-        own, pose = stance.pose.to(self.device), self.other.pose.to(self.device)
-        home = go2.HOME.to(self.device)
+        own, pose, home = (constant(each, place) for each in (stance.pose, self.other.pose, go2.HOME))
         toward = place[:, None]
         q = home + toward.clamp(min=0) * (own - home) + (-toward).clamp(min=0) * (pose - home)
-        q = (q + self._uniform((n, 12), -1, 1) * cfg.joints).clamp(
-            go2.Q_LOWER.to(self.device), go2.Q_UPPER.to(self.device)
-        )
+        q = within(q + self._uniform((n, 12), -1, 1) * cfg.joints)
         pitch = stance.sign * place * math.pi / 2 + self._uniform(n, -1, 1) * wobble
         roll = self._uniform(n, -1, 1) * 0.5 * wobble
         x = torch.zeros(n, 37, device=self.device)
@@ -200,7 +198,7 @@ class Starts:
         lowest = torch.cat([gap["foot"], gap["thigh"], gap["calf"], gap["trunk"][:, None]], 1).amin(1)
         x[:, 2] = lift + 0.001 - lowest
         feet = go2.leg_points(q)[:, :, 2] @ go2.rotation(x[:, 3:7]).transpose(1, 2)
-        near = torch.where(toward[:, :, None] >= 0, feet[:, list(stance.support)], feet[:, list(stance.free)])
+        near = torch.where(toward[:, :, None] >= 0, feet[:, stance.standing], feet[:, stance.swing])
         arm = -near.mean(1)  # from the pivot to the base
         rise = (go2.STANCE_HEIGHT - x[:, 2]).clamp(min=0.02)
         inertia = arm.square().sum(1) + GYRATION2
@@ -227,9 +225,25 @@ def _read(path: Path, device: torch.device) -> dict[str, Tensor]:
     return found
 
 
-def _average(values: Tensor, index: Tensor, samples: Tensor, keep: float) -> None:
-    """Move each entry of `values` towards the mean of the samples (n,) at its index (n,), by their number."""
-    count = torch.bincount(index, minlength=len(values))
-    total = torch.zeros_like(values).index_add_(0, index, samples)
+def within(q: Tensor) -> Tensor:
+    """Joint positions (n, 12), no further than the joints go [rad]."""
+    return q.clamp(constant(go2.Q_LOWER, q), constant(go2.Q_UPPER, q))
+
+
+def average(values: Tensor, index: Tensor, samples: Tensor, counted: Tensor, keep: float) -> None:
+    """Move each entry of `values` towards the mean of the samples at its index, by their number.
+
+    Args:
+        values: averages so far, (v,).
+        index: of each sample, where it belongs, (n,).
+        samples: true or false, (n,) bool.
+        counted: which samples there are, (n,) bool; the others' indices mean nothing.
+        keep: share of the old average that one sample leaves.
+    """
+    index = torch.where(counted, index, 0)
+    count, total = (
+        torch.zeros_like(values).index_add_(0, index, each.to(values))
+        for each in (counted, samples & counted)
+    )
     kept = keep**count
     values.mul_(kept).add_((1 - kept) * total / count.clamp(min=1))

@@ -13,6 +13,8 @@ from torch import Tensor
 from hmc.go2.facts import OBS_SIZE
 from hmc.go2.stances import BETWEEN, FOOTSTAND, HANDSTAND
 from hmc.sim.base import Sim
+from hmc.sim.device import constant
+from train.chosen import Chosen, pick, put
 from train.env import EnvCfg, Gap, Go2Env, Start
 from train.rewards import RewardCfg, stage_rewards
 from train.stance import low, touches
@@ -91,8 +93,8 @@ class UnifiedStarts:
         nobody flips who cannot rise into the handstand.
         """
         foot, hand = self.stances
-        held, risen = bool(foot.rates[STANCE] > HELD), hand.frontier() <= Starts.HORIZONTAL
-        goal = self.goals.clamp(max=2 if held and risen else 1 if held else 0)
+        held, risen = foot.rates[STANCE] > HELD, hand.frontier() <= Starts.HORIZONTAL
+        goal = torch.minimum(self.goals, held * (1 + risen.long()))
         drawn = [source.draw(n) for source in self._sources]
         x, u, kind, cell = (
             torch.stack(parts)[goal, torch.arange(n, device=self.device)]
@@ -100,13 +102,13 @@ class UnifiedStarts:
         )
         return Start(x, u, kind + goal * len(KINDS), cell)
 
-    def report(self, kind: Tensor, cell: Tensor, success: Tensor) -> None:
-        """Learn from ended episodes: their kind, cell and whether they ended as asked, all (n,)."""
+    def report(self, kind: Tensor, cell: Tensor, success: Tensor, ended: Tensor) -> None:
+        """Learn from episodes that `ended`: kind, cell and whether they ended as asked, all (n,)."""
         for goal, source in enumerate(self._sources):
             own = torch.div(kind, len(KINDS), rounding_mode="floor") == goal
-            source.report(kind[own] % len(KINDS), cell[own], success[own])
+            source.report(kind % len(KINDS), cell, success, ended & own)
 
-    def log(self) -> dict[str, float]:
+    def log(self) -> dict[str, Tensor]:
         """How far each way is open."""
         return {f"{starts.stance.name}_frontier": starts.frontier() for starts in self.stances}
 
@@ -167,7 +169,7 @@ class UnifiedEnv(Go2Env):
         return self.command[:, 0] > 0
 
     def targets(self, actions: Tensor) -> Tensor:
-        shift = TOWARDS.to(actions) * self.command / self.cfg.action_scale
+        shift = constant(TOWARDS, actions) * self.command / self.cfg.action_scale
         return super().targets(actions + shift)
 
     def rewards(self, x: Tensor, before: Tensor, u: Tensor, u_prev: Tensor, gap: Gap) -> dict[str, Tensor]:
@@ -192,11 +194,13 @@ class UnifiedEnv(Go2Env):
     def good(self, x: Tensor, gap: Gap) -> Tensor:
         return torch.where(self._hand, HANDSTAND.held(x, gap), FOOTSTAND.held(x, gap))
 
-    def _reset(self, ids: Tensor) -> None:
-        self.starts.goals = self._goals[ids]
-        super()._reset(ids)
+    def _reset(self, chosen: Chosen) -> None:
+        self.starts.goals = pick(self._goals, chosen)
+        super()._reset(chosen)
         first, last = (seconds / self.sim.dt for seconds in self.cfg.told)
-        self._told[ids] = (first + (last - first) * torch.rand(len(ids), device=self.device)).long()
-        kind = self._kind[ids]
+        share = torch.rand(len(chosen), device=self.device)
+        put(self._told, chosen, (first + (last - first) * share).long())
+        kind = pick(self._kind, chosen)
         hand = (kind >= len(KINDS)) & (kind != FLIP)
-        self.command = self.command.index_copy(0, ids, torch.where(hand, 1.0, -1.0)[:, None])
+        self.command = self.command.clone()
+        put(self.command, chosen, torch.where(hand, 1.0, -1.0)[:, None])

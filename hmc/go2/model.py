@@ -34,6 +34,7 @@ from hmc.go2.facts import REAR as REAR
 from hmc.go2.facts import STALL as STALL
 from hmc.go2.facts import STANCE_HEIGHT as STANCE_HEIGHT
 from hmc.go2.facts import SUBSTEPS as SUBSTEPS
+from hmc.sim.device import constant
 
 Q_LOWER, Q_UPPER = torch.tensor(facts.Q_LOWER), torch.tensor(facts.Q_UPPER)
 GEAR = torch.tensor(facts.GEAR)
@@ -200,7 +201,7 @@ def clearances(x: Tensor) -> dict[str, Tensor]:
     ahead = tx * cos[..., 2] + down * sin[..., 2]
     foot = knee + drop[..., 1] - FOOT_BACK * ahead
     calf_end = knee + CALF_END[1] / LINK * drop[..., 1] + CALF_END[0] * ahead
-    px, py, pz, radius = TRUNK_POINTS.to(x).unbind(1)
+    px, py, pz, radius = constant(TRUNK_POINTS, x).unbind(1)
     return {
         "foot": foot - FOOT_RADIUS,
         "thigh": torch.minimum(hip, knee) - 0.017,

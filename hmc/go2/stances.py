@@ -39,6 +39,11 @@ class Stance:
         """The free legs as a slice of `LEGS`."""
         return slice(self.free[0], self.free[1] + 1)
 
+    @property
+    def standing(self) -> slice:
+        """The supporting legs likewise."""
+        return slice(self.support[0], self.support[1] + 1)
+
     def uprightness(self, x: Tensor) -> Tensor:
         """Cosine of the angle between the body's x axis and this stance's vertical, (n,)."""
         return -self.sign * go2.vertical(x[:, 3:7])[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -43,3 +44,18 @@ def free_memory(device: torch.device) -> float:
 def upload(values: NDArray[Any], device: torch.device) -> Tensor:
     """An array as a tensor on a device, without waiting for what the device has to do before it."""
     return torch.from_numpy(values).to(device, non_blocking=True)
+
+
+def constant(values: Tensor, like: Tensor) -> Tensor:
+    """A module's constant in the type and on the device of another tensor, copied there once.
+
+    Each copy to a GPU waits until that has done what it was told before. `values` is to be the same
+    object at every call.
+    """
+    return _copied(values, like.dtype, like.device)
+
+
+@cache
+def _copied(values: Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return values.to(device, dtype)

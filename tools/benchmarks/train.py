@@ -80,7 +80,7 @@ def iterations(args: Train, cfg: TrainCfg, env: Go2Env) -> np.ndarray:
         runner = Runner(env, rsl_config(cfg.ppo), folder, str(env.device), meta)
         began = [0.0]
 
-        def update(log: dict[str, Any], extras: list[dict[str, Any]]) -> None:
+        def update(log: dict[str, Any], means: dict[str, float]) -> None:
             now = time.perf_counter()
             entries.append((now - began[0], log["collect_time"], log["learn_time"], spent[0]))
             began[0], spent[0] = now, 0.0
