@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hmc.sim.base import Sim
+
 
 class Mode(ABC):
     """A controller, batched over worlds.
@@ -29,6 +31,7 @@ class Mode(ABC):
     name: str
     memory_size: int = 0
     control_steps: int = 0  # rolled out inside the mode so far: a planner counts them as its own
+    sims: tuple[Sim, ...] = ()  # that it rolls out in: a planner tells of what did not fit there, too
 
     def reset(self, x: Tensor, u: Tensor, k: Tensor) -> Tensor:
         """Memory at entry, (n, memory_size).

@@ -269,7 +269,8 @@ def plan(
         raise PlanInterrupted(_plan(search, incumbent)) from None
     search.evaluator.follow(search.schedule)
     meter.settle()
-    tell_overflow(search.evaluator.sim)
+    for used in (search.evaluator.sim, *(sim for each in task.modes for sim in each.sims)):
+        tell_overflow(used)
     return _plan(search, incumbent)
 
 

@@ -355,6 +355,7 @@ class SamplingMpc(Mode):
         """Costs of plans (n, S, K, nu) from states x (n, nx), (n, S), in parts of the simulator's size."""
         if self._sim is None:
             self._sim = self._make_sim(self.cfg.worlds)
+            self.sims = (self._sim,)
         n, s = plans.shape[:2]
         k = upload(k.numpy(), x.device)
         flat = plans.reshape(n * s, self.cfg.knots, self.nu)

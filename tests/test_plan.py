@@ -351,3 +351,7 @@ def test_what_did_not_fit_is_said():
         UserWarning, match="did not fit and count as diverged: 1,234 by contacts; .* contacts="
     ):
         plan(replace(toy_task(3), make_sim=Tight), FAR)
+    inner = Damp()
+    inner.sims = (Tight(1),)
+    with pytest.warns(UserWarning, match="1,234 by contacts"):
+        plan(toy_task(3, [inner, Ramp()]), FAR)
