@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,4 +32,19 @@ def work(folder: Path, fatal: int, job: Job) -> Row:
     if job.number == fatal and not died.exists():
         died.touch()
         os.kill(os.getpid(), signal.SIGKILL)
+    return Row(job, job.number**2)
+
+
+def work_on_a_node(folder: Path, head: str, job: Job) -> Row:
+    """The square. The node other than `head` is lost: it ends with the second job that begins there."""
+    import ray
+
+    away = ray.get_runtime_context().get_node_id() != head
+    (folder / f"{'away' if away else 'head'}_{job.number}").touch()
+    if away and len(list(folder.glob("away_*"))) == 2:
+        for process in (os.getppid(), os.getpid()):  # what runs the node, and this worker before it is done
+            os.kill(process, signal.SIGKILL)
+    give_up = time.monotonic() + 60
+    while not away and len(list(folder.glob("away_*"))) < 2 and time.monotonic() < give_up:
+        time.sleep(0.1)
     return Row(job, job.number**2)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import gc
 import importlib.util
+import subprocess
 import sys
+import tempfile
+import time
 from collections import Counter
 from functools import partial
 from pathlib import Path
@@ -13,7 +16,7 @@ import pytest
 import tyro
 from rich.console import Console
 
-from tests.squares import Job, Row, work
+from tests.squares import Job, Row, work, work_on_a_node
 from tools import cluster, robustness, study
 
 HAS_RAY = importlib.util.find_spec("ray") is not None
@@ -45,6 +48,51 @@ def test_a_lost_worker(tmp_path):
     assert studied(tmp_path, jobs) == expected
     assert begun(tmp_path).total() == 5, "nothing left to do"
     gc.collect()  # what Ray left, while its warnings are ignored
+
+
+@pytest.fixture
+def two_machines(monkeypatch):
+    """A cluster of two nodes on this machine, a core each; the second one is lost or ends with the test."""
+    import ray
+
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:  # a path that is short enough for sockets
+        monkeypatch.setenv("RAY_TMPDIR", folder)
+        cluster.join("", 1)
+        command = [str(Path(sys.executable).with_name("ray")), "start", "--num-cpus=1", "--block"]
+        command.append(f"--address={ray.get_runtime_context().gcs_address}")
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT) as node:
+            give_up = time.monotonic() + 60
+            while len(ray.nodes()) < 2 and time.monotonic() < give_up:
+                time.sleep(0.1)
+            yield
+            ray.shutdown()
+            node.terminate()
+
+
+@needs_ray
+def test_a_lost_machine(tmp_path, two_machines):
+    """Its job runs again elsewhere; every row is there once."""
+    import ray
+
+    assert len(ray.nodes()) == 2
+    jobs = [Job(i) for i in range(6)]
+    head = ray.get_runtime_context().get_node_id()
+    found = cluster.on_ray(partial(work_on_a_node, tmp_path, head), jobs)
+    assert sorted(found, key=lambda row: row.job.number) == [Row(job, job.number**2) for job in jobs]
+    away = {path.name.removeprefix("away_") for path in tmp_path.glob("away_*")}
+    assert len(away) == 2, "two began there"
+    assert any((tmp_path / f"head_{number}").exists() for number in away), "again"
+
+
+@needs_ray
+def test_a_cluster_that_was_killed_is_not_looked_for(tmp_path, monkeypatch):
+    """It leaves its address behind, and Ray would try to join it for ever."""
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    monkeypatch.setattr("ray._private.services.find_gcs_addresses", set)
+    (tmp_path / "ray").mkdir()
+    for folder in (tmp_path, tmp_path / "ray"):
+        (folder / "ray_current_cluster").write_text("127.0.0.1:1")
+    assert cluster._current() == ""
 
 
 @needs_ray

@@ -41,19 +41,35 @@ def join(address: str, cores: int) -> None:
     address = address or os.environ.get("RAY_ADDRESS", "auto")
     try:
         if address != "auto":
-            host, _, port = address.removeprefix("ray://").rpartition(":")
-            socket.create_connection((host, int(port)), timeout=10).close()  # Ray would try for minutes
-        try:
+            _reach(address)
             ray.init(address, **quiet)
-        except ConnectionError:
-            if address != "auto":
-                raise
+        elif here := _current():
+            ray.init(here, **quiet)
+        else:
             _start(cores, **quiet)
     except Exception as error:  # of any kind: Ray raises the bare one, too
         raise ValueError(
             f"no Ray cluster to work on at {address} ({error}): start its head with 'ray start --head' and "
             "name it as HOST:PORT, or leave --ray out: processes of this machine do the work then"
         ) from error
+
+
+def _reach(address: str) -> None:
+    """Raise an error unless something answers at an address: Ray would try for minutes, or for ever."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    socket.create_connection((host, int(port)), timeout=10).close()
+
+
+def _current() -> str:
+    """The cluster that this machine is part of; empty if there is none, or none any more."""
+    from ray._private.services import get_ray_address_from_environment
+
+    try:
+        address = str(get_ray_address_from_environment("auto", None))
+        _reach(address)  # one that was killed has left its address
+    except OSError:
+        return ""
+    return address
 
 
 def _start(cores: int, attempts: int = 3, **quiet: Any) -> None:
