@@ -12,7 +12,7 @@ import numpy as np
 from deploy.observe import anchor_of
 from deploy.settings import PlanCfg
 from deploy.so3 import Array
-from hmc.go2.network import Network
+from hmc.go2.network import Network, follow
 
 NAMES = ("foot", "jump", "hand")  # the modes of hmc.go2.task.flip_task, in its order
 FOOT, JUMP, HAND = range(3)
@@ -66,7 +66,7 @@ class Performer:
 
     Attributes:
         mode: that ran last; NONE before the first.
-        anchor: where it was entered, (4,).
+        anchor: where it was entered, or what `hmc.go2.observe.follow` makes of that, (4,).
         entered: tick at which it was.
         plan: that runs; None before the first.
         counts: plans taken over, late and stale.
@@ -108,6 +108,7 @@ class Performer:
         if mode == JUMP:
             assert self.plan is not None
             return self.plan.u[k - self.plan.begin]
+        self.anchor = follow(x[None], self.anchor[None])[0]
         return self._policies[mode].act(x[None], u[None], self.anchor[None])[0]
 
     def take_over(self, k: int) -> None:

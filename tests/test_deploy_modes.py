@@ -15,9 +15,10 @@ from deploy import observe as ours
 from deploy.modes import FOOT, HAND, JUMP, NONE, Performer, Plan, due
 from deploy.settings import PlanCfg
 from deploy.slots import PLAN
+from hmc.go2 import facts
 from hmc.go2 import model as go2
 from hmc.go2 import observe as theirs
-from hmc.go2.network import LOWER, UPPER, Network
+from hmc.go2.network import LOWER, UPPER, Network, follow
 from hmc.go2.network import anchor_of as anchor_in_numpy
 from hmc.go2.network import observe as observe_in_numpy
 from hmc.go2.policy import Policy
@@ -53,6 +54,20 @@ def test_observation_is_that_of_training_and_planning():
         assert ours.pitch(up[i]) == pytest.approx(angles[i], abs=1e-12)
 
 
+def test_an_anchor_follows_a_robot_that_is_far_from_it():
+    x, _, anchor = states(500)
+    followed = follow(x, anchor)
+    assert np.array_equal(followed, theirs.follow(*map(torch.from_numpy, (x, anchor))).numpy())
+    distance = np.linalg.norm(x[:, :2] - anchor[:, :2], axis=1)
+    near = distance <= facts.LEASH
+    assert 0 < near.sum() < len(x)
+    assert np.array_equal(followed[near], anchor[near])
+    np.testing.assert_allclose(np.linalg.norm(x[:, :2] - followed[:, :2], axis=1)[~near], facts.LEASH)
+    away, origin = np.zeros((1, 37)), np.array([[0.0, 0.0, 0.6, 0.8]])
+    away[0, :2] = 3.0, 4.0  # 5 m off: all but 1 m of it is followed
+    np.testing.assert_allclose(follow(away, origin), [[2.4, 3.2, 0.6, 0.8]])
+
+
 def test_pitch_and_lean_by_hand():
     assert ours.pitch(np.array([1.0, 0.0, 0.0])) == pytest.approx(-math.pi / 2)  # x up: on the hind legs
     assert ours.pitch(np.array([0.0, 0.0, 1.0])) == 0.0
@@ -68,10 +83,12 @@ def test_policy_is_the_planners(path):
     x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
     here, there = Network(path), Policy(path)
     tx, tu, ta = (torch.from_numpy(part) for part in (x, u, anchor))
-    expected, _ = there.act(tx, tu, ta, torch.zeros(len(x), dtype=torch.long))
+    expected, memory = there.act(tx, tu, ta, torch.zeros(len(x), dtype=torch.long))
     for i in range(len(x)):
-        (target,) = here.act(x[i : i + 1], u[i : i + 1], anchor[i : i + 1])
+        at = follow(x[i : i + 1], anchor[i : i + 1])
+        (target,) = here.act(x[i : i + 1], u[i : i + 1], at)
         np.testing.assert_allclose(target, expected[i].numpy(), atol=0, rtol=0)
+        assert np.array_equal(at[0], memory[i].numpy())
         assert (target >= LOWER).all()
         assert (target <= UPPER).all()
 
@@ -116,7 +133,7 @@ def play(it: Performer, first: int, last: int) -> tuple[str, list[float]]:
     for k in range(first, last):
         it.take_over(k)
         x = np.zeros(37)
-        x[0], x[3] = k, 1.0
+        x[0], x[3] = 0.1 * k, 1.0  # m
         targets.append(float(it.act(k, x, np.zeros(12))[0]))
         modes += "fjh"[it.mode]
     return modes, targets
@@ -137,7 +154,7 @@ def test_a_plan_runs_from_its_begin_on_and_its_jump_as_planned():
     assert targets[4:6] == [102.0, 103.0]
     assert it.plan is not None
     assert it.plan.number == 1
-    assert it.anchor[0] == 9  # where the handstand's mode was entered
+    assert it.anchor[0] == 0.1 * 9  # where the handstand's mode was entered
     foot = it._policies[FOOT]
     assert isinstance(foot, Counting)
     assert {anchor[0] for anchor in foot.anchors} == {0}  # kept while the mode runs on

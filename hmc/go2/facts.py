@@ -45,6 +45,7 @@ SUBSTEPS = 4  # physics steps a control step
 
 OBS_SIZE = 48
 OBS_VERSION = 1  # of `hmc.go2.observe`
+LEASH = 1.0  # m: the furthest that a policy is from its anchor; in training it seldom is further
 # what a learned mode is commanded by, at the end of its observation; its base position is only a height
 COMMANDS = {
     "walk": ("forward [m/s]", "sideways [m/s]", "turn [rad/s]"),

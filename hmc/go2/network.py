@@ -63,6 +63,18 @@ def anchor_of(x: Array) -> Array:
     return np.stack([x[:, 0], x[:, 1], ahead, -across], 1, dtype=x.dtype)
 
 
+def follow(x: Array, anchor: Array) -> Array:
+    """Anchors (n, 4) drawn along as by `hmc.go2.observe.follow`, by the same operations."""
+    dx, dy = x[:, 0] - anchor[:, 0], x[:, 1] - anchor[:, 1]
+    distance = np.sqrt(dx * dx + dy * dy)
+    far = distance > facts.LEASH
+    if not far.any():
+        return anchor
+    share = facts.LEASH / np.maximum(distance, facts.LEASH)
+    at = np.stack([x[:, 0] - share * dx, x[:, 1] - share * dy], 1)
+    return np.concatenate([np.where(far[:, None], at, anchor[:, :2]), anchor[:, 2:]], 1)
+
+
 def _rotation(x: Array, which: slice) -> Array:
     """Some of the 9 entries, row by row, of the rotations body to world at states x (n, 37), (entries, n)."""
     factors = x.T[3:7].take(_PAIRS[..., which], 0)

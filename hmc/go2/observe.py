@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hmc.go2.facts import LEASH
 from hmc.go2.model import rotation, vertical
 
 
@@ -48,6 +49,18 @@ def anchor_of(x: Tensor) -> Tensor:
     left = rotation(x[:, 3:7])[:, :2, 1]
     left = left / left.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     return torch.stack([x[:, 0], x[:, 1], left[:, 1], -left[:, 0]], -1)
+
+
+def follow(x: Tensor, anchor: Tensor) -> Tensor:
+    """Anchors (n, 4), drawn along so that states x (n, 37) are within `LEASH` of them.
+
+    A stance that drifts would otherwise see numbers that it was never trained with, and fall.
+    """
+    dx, dy = (x[:, :2] - anchor[:, :2]).unbind(-1)
+    distance = (dx * dx + dy * dy).sqrt()
+    share = LEASH / distance.clamp(min=LEASH)
+    at = torch.stack([x[:, 0] - share * dx, x[:, 1] - share * dy], -1)
+    return torch.cat([torch.where((distance > LEASH)[:, None], at, anchor[:, :2]), anchor[:, 2:]], -1)
 
 
 def pitch(x: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hmc.go2 import network
 from hmc.go2.network import LOWER, UPPER, Network
-from hmc.go2.observe import anchor_of, observe
+from hmc.go2.observe import anchor_of, follow, observe
 from hmc.go2.torch_network import TorchNetwork
 from hmc.modes import Mode
 
@@ -18,7 +18,8 @@ from hmc.modes import Mode
 class Policy(Mode):
     """A learned mode from a file, see `hmc.go2.network.Network`.
 
-    Memory: the anchor, where the mode was entered (see `hmc.go2.observe`).
+    Memory: the anchor, where the mode was entered, drawn along with a robot that drifts far (see
+    `hmc.go2.observe`).
 
     Attributes:
         network: the file's.
@@ -62,8 +63,10 @@ class Policy(Mode):
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         told = () if self.command is None else (self.command(x, k),)
         if x.device.type != "cpu":
+            memory = follow(x, memory)
             return self.on_device(x, u, memory, *told), memory
         # in numpy: for few worlds a torch operation takes several times as long
+        memory = torch.from_numpy(network.follow(x.numpy(), memory.numpy()))
         target = self.network.act(*(each.numpy() for each in (x, u, memory, *told)))
         return torch.from_numpy(target).to(x), memory
 
