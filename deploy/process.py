@@ -17,6 +17,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 _PR_SET_PDEATHSIG = 1
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # of mlockall(2)
 # matrices of 29 rows only lose by threads, which wait for each other in loops that fill a core
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
@@ -99,10 +100,12 @@ def until_told(parent_matters: bool = True) -> Callable[[], bool]:
 def real_time(priority: int) -> bool:
     """Ask the kernel for a real-time priority, before other threads start; whether it was granted.
 
-    What is loaded by now is not looked at by the garbage collector any more.
+    What is loaded by now is not looked at by the garbage collector any more, and what is in memory stays
+    there, if the kernel lets it: to read a page of a library from the disk again takes tens of milliseconds.
     """
     gc.collect()
     gc.freeze()
+    ctypes.CDLL(None).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         return True
