@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import gc
-import os
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,10 +13,12 @@ import numpy as np
 from deploy.dds import LOOPBACK, SIMULATION_DOMAIN, Link, LinkError
 from deploy.messages import LowCmd_, LowState_, WirelessController_
 from deploy.motion_switcher import MotionSwitcherService
+from deploy.process import real_time
 from tools.robot.orders import Desk, obey
 from tools.robot.standin import PERIOD, Settings, StandIn, Truth
 
 CONTROLLER = "mcf"  # what the motion switcher calls the robot's own controller
+PRIORITY = 40
 COMPANY = 0.3  # s that other robots get to be found
 LATEST = 0.05  # s behind the clock, at most; then the robot loses time instead of hurrying after it
 
@@ -139,10 +138,7 @@ def _pressed(robot: StandIn) -> WirelessController_:
 
 def priority() -> str:
     """Ask the kernel for real-time priority, and say what came of it."""
-    gc.collect()
-    gc.freeze()  # what is loaded by now stays: later collections are short
-    with suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))
+    if real_time(PRIORITY):
         return "real-time priority"
     return "normal priority (real-time needs CAP_SYS_NICE)"
 
