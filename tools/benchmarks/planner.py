@@ -137,19 +137,22 @@ def _omega(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
         )
 
 
+class _Recorded(MujocoSim):
+    """Keeps the inputs of its last rollout, (n, steps, nu)."""
+
+    given: Tensor
+
+    def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
+        self.given = controls
+        return super().rollout(controls, ids)
+
+
 def _replan(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
     """One MPPI update against the bare engine's rollouts under the same inputs."""
     settings = replace(cfg.task.jump.sampling, samples=30, horizon=40, replan_every=40, worlds=30)
-    sim, bare = (MujocoSim(load_model(), 30, substeps=SUBSTEPS, threads=args.threads) for _ in range(2))
+    sim, bare = (_Recorded(load_model(), 30, substeps=SUBSTEPS, threads=args.threads) for _ in range(2))
     mpc = jump_mode(replace(cfg.task.jump, sampling=settings), lambda n: sim, seed=0)
     x, u = (row[None] for row in closed_loop.disturbed_start(cfg.start, 0))
-    given: list[Tensor] = []
-
-    def keep(controls: Tensor, ids: Tensor) -> Tensor:
-        given[:] = [controls]
-        return MujocoSim.rollout(sim, controls, ids)
-
-    sim.rollout = keep  # type: ignore[method-assign]
     took: list[list[float]] = [[], []]
     for i in range(3 * args.repeats):
         k = torch.tensor([i])
@@ -158,7 +161,7 @@ def _replan(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
         mpc.act(x, u, memory, k)
         took[0].append(time.perf_counter() - began)
         bare.reset(x.expand(30, -1), u.expand(30, -1))
-        held = given[0].repeat_interleave(SUBSTEPS, 1).numpy()
+        held = sim.given.repeat_interleave(SUBSTEPS, 1).numpy()
         began = time.perf_counter()
         bare.batch.rollout(held.shape[1], held, record=("qpos", "qvel"))
         took[1].append(time.perf_counter() - began)
