@@ -124,12 +124,15 @@ class WatchdogCfg:
 
     Attributes:
         period: between two looks, and two damping commands [s].
-        hang: age of the control process's heartbeat at which it counts as hung [s].
+        hang: age of the control process's heartbeat at which it counts as hung, without the time in which the
+            watchdog stood still itself [s].
+        stall: age at which it does in any case [s].
         lost: age of the watchdog's own at which the control process damps [s].
     """
 
     period: float = 0.004
     hang: float = 0.07
+    stall: float = 0.2
     lost: float = 0.5
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import time
@@ -29,6 +30,9 @@ def damping(gain: float) -> bytes:
 class Watchdog:
     """Looks at the control process, and latches.
 
+    Silence is counted in looks: when the whole machine stood still, the watchdog with it, the control process
+    gets the time to beat that it has otherwise, up to `stall`.
+
     Attributes:
         reason: why the robot is damped; "" while it is not.
 
@@ -40,6 +44,8 @@ class Watchdog:
     def __init__(self, board: Board, cfg: WatchdogCfg):
         self.reason = ""
         self._board, self._cfg = board, cfg
+        self._beat = self._looked = -math.inf  # time of the last heartbeat and look [s]
+        self._silent = 0.0  # since that heartbeat, as far as it was looked [s]
 
     def look(self, gone: bool, now: float) -> bool:
         """Whether the robot is to be damped.
@@ -52,10 +58,14 @@ class Watchdog:
         # a control process that has commanded nothing yet leaves the robot as it is
         if not self.reason and heart is not None and heart["commanding"]:
             age = now - float(heart["t"])
+            if heart["t"] != self._beat:
+                self._beat, self._silent = float(heart["t"]), 0.0
+            self._silent += min(age - self._silent, now - self._looked, 2 * self._cfg.period)
             if gone:
                 self.reason = "the control process ended"
-            elif age > self._cfg.hang:
+            elif self._silent > self._cfg.hang or age > self._cfg.stall:
                 self.reason = f"the control process hung for {1e3 * age:.0f} ms"
+        self._looked = now
         guard = self._board.guard.blank()
         guard["t"], guard["pid"] = now, os.getpid()
         guard["latched"], guard["reason"] = bool(self.reason), text(self.reason)

@@ -45,20 +45,40 @@ def beat(board: Board, t: float, commanding: bool = True) -> None:
     board.heart.write(heart)
 
 
+def looks(it: Watchdog, first: float, last: float) -> bool:
+    """Whether it damps, looking every 4 ms between these times [s]."""
+    return any(it.look(gone=False, now=first + 0.004 * k) for k in range(round((last - first) / 0.004)))
+
+
 def test_watchdog_latches_by_age_and_death_and_never_before_the_first_command(board):
     it = Watchdog(board, WatchdogCfg(hang=0.07))
     assert not it.look(gone=False, now=1.0)  # nobody there yet
     beat(board, 1.0, commanding=False)
     assert not it.look(gone=True, now=9.0)  # it never moved the robot
     beat(board, 9.0)
-    assert not it.look(gone=False, now=9.069)
-    assert it.look(gone=False, now=9.071)
+    assert not looks(it, 9.001, 9.070)
+    assert it.look(gone=False, now=9.072)
     beat(board, 10.0)  # it wakes up again
     assert it.look(gone=False, now=10.0)
-    assert said(board.guard.read()["reason"].item()) == "the control process hung for 71 ms"
+    assert said(board.guard.read()["reason"].item()) == "the control process hung for 72 ms"
     other = Watchdog(board, WatchdogCfg())
     assert other.look(gone=True, now=10.0)
     assert other.reason == "the control process ended"
+
+
+def test_a_pause_of_the_whole_machine_is_no_hang(board):
+    """The watchdog stands still with the control process, which then gets the time that it has otherwise."""
+    it = Watchdog(board, WatchdogCfg(period=0.004, hang=0.07, stall=0.2))
+    beat(board, 1.0)
+    assert not looks(it, 1.0, 1.02)
+    assert not looks(it, 1.15, 1.19)  # 130 ms later
+    beat(board, 1.19)
+    assert not looks(it, 1.19, 1.25)
+    assert it.look(gone=False, now=1.40), "but no longer than this"
+    it = Watchdog(board, WatchdogCfg(period=0.004, hang=0.07, stall=0.2))
+    beat(board, 2.0)
+    assert not looks(it, 2.0, 2.02)
+    assert looks(it, 2.10, 2.16), "after the pause it hung"
 
 
 @contextmanager
