@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -28,15 +27,6 @@ def cfg(tmp_path_factory) -> GrowthCfg:
     base = (*SHORT, "task.jump.mpc=false", f"task.foot={path}", f"task.hand={path}")
     made = GrowthCfg(trials=2, first_seed=7, base=base, factors=FACTORS)
     return replace(made, flip=settings(made, Job("horizon", 6, 7)))
-
-
-def stub_load(monkeypatch: pytest.MonkeyPatch, cfg: GrowthCfg) -> None:
-    """The program reads this study, and cfg/flip.toml as it is."""
-
-    def stub(path: Any, kind: Any, items: Any = ()) -> Any:
-        return cfg if kind is GrowthCfg else load(path, kind, items)
-
-    monkeypatch.setattr("tools.growth.load", stub)
 
 
 def test_the_committed_study_can_be_read():
@@ -90,7 +80,7 @@ def test_the_program(cfg, tmp_path, monkeypatch, capsys):
             yield do(job)
 
     monkeypatch.setattr(study, "run_all", some)
-    stub_load(monkeypatch, cfg)
+    monkeypatch.setattr(growth, "study_cfg", lambda *_: cfg)
     args = growth.Args(out=tmp_path)
     assert growth.main(args) == 1
     assert len(done) == 3
@@ -109,7 +99,7 @@ def test_the_program(cfg, tmp_path, monkeypatch, capsys):
 
 def test_an_unknown_key_is_named(cfg, monkeypatch, capsys, tmp_path):
     wrong = replace(cfg, factors=(FactorCfg("speed", "m/s", "task.speed", (1.0,)),))
-    stub_load(monkeypatch, wrong)
+    monkeypatch.setattr(growth, "study_cfg", lambda *_: wrong)
     with pytest.raises(SystemExit):
         growth.main(growth.Args(out=tmp_path))
     assert "task.speed" in capsys.readouterr().err

@@ -174,12 +174,13 @@ S = TypeVar("S")
 def study_cfg(path: Path, kind: type[S], items: tuple[str, ...]) -> S:
     """A study's file with the flip of the flip.toml beside it as its `flip`.
 
-    Overrides that begin with ``flip.`` are the latter's.
+    Overrides that begin with ``flip.`` are the latter's, and so is the study's `base`, if it has one.
     """
     own = tuple(item for item in items if not item.startswith("flip."))
     flip = tuple(item.removeprefix("flip.") for item in items if item.startswith("flip."))
     found: Any = load(path, kind, own)
-    return cast(S, replace(found, flip=load(path.with_name("flip.toml"), RunCfg, flip)))
+    base = getattr(found, "base", ())
+    return cast(S, replace(found, flip=load(path.with_name("flip.toml"), RunCfg, (*base, *flip))))
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from hmc.cfg import load  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, stance_cost, timeline  # noqa: E402
 from tools import figures, study  # noqa: E402
-from tools.closed_loop import RunCfg, planned, run  # noqa: E402
+from tools.closed_loop import RunCfg, planned, run, study_cfg  # noqa: E402
 
 IDLE = ("stand", "getup", "home", "crouch")  # in the order in which modes without use come in
 FLIP = ROOT / "cfg" / "flip.toml"
@@ -216,8 +216,7 @@ class Args(study.Workers):
 def main(args: Args) -> int:
     """Do what is left of the study, write everything."""
     with one_line_errors():
-        cfg = load(ROOT / "cfg" / "growth.toml", GrowthCfg, args.set)
-        cfg = replace(cfg, flip=load(FLIP, RunCfg, cfg.base))
+        cfg = study_cfg(ROOT / "cfg" / "growth.toml", GrowthCfg, args.set)
         for factor in cfg.factors:
             settings(cfg, Job(factor.name, factor.values[0], 0))  # what is wrong with a key shows here
         folder = study.folder_of(args.out, cfg, args.resume)

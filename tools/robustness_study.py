@@ -46,8 +46,8 @@ class RobustnessCfg:
         trials: runs of each planner under all conditions at once.
         first_seed: of the first.
         sweep_trials: runs at each value of a factor.
-        mpc: whether the jump is planned by sampling MPC. A noisy state makes every tick's jumps new ones,
-            which takes ten times as long; the deployed planner plays the jump's guess as it is, too.
+        base: overrides of cfg/flip.toml that always hold, here those of the deployed planner. A noisy state
+            makes every tick's jumps new ones, which sampling MPC would take ten times as long for.
         command: time of the command [s]; the search and the task are otherwise those of cfg/flip.toml.
         seconds: length of a run [s].
         foot_push: earliest and latest moment of the push in the foot stand [s].
@@ -56,13 +56,13 @@ class RobustnessCfg:
         ensemble: models that the planner called by this name plans on.
         sweep: factors and their values, in the units of `VariantsCfg`; noise: times that of the conditions;
             push: speed [m/s].
-        flip: cfg/flip.toml.
+        flip: cfg/flip.toml under `base`.
     """
 
     trials: int = 100
     first_seed: int = 200
     sweep_trials: int = 10
-    mpc: bool = False
+    base: tuple[str, ...] = ()
     command: float = 3.0
     seconds: float = 9.2
     foot_push: tuple[float, float] = (0.4, 1.2)
@@ -146,8 +146,7 @@ def work(cfg: RobustnessCfg, job: Job) -> Row:
     """One run, on one core."""
     torch.set_num_threads(1)
     ensemble = cfg.ensemble if job.planner == "ensemble" else EnsembleCfg()
-    jump = replace(cfg.flip.task.jump, mpc=cfg.mpc)
-    settings = replace(cfg.flip.task, command=round(cfg.command / go2.DT), jump=jump, ensemble=ensemble)
+    settings = replace(cfg.flip.task, command=round(cfg.command / go2.DT), ensemble=ensemble)
     flip = replace(cfg.flip, seconds=cfg.seconds, task=settings)
     task = flip_task(settings, seed=job.seed, threads=1)
     pushes = pushes_of(cfg, job)
