@@ -40,7 +40,7 @@ def moved(stance: Stance = HANDSTAND, **entries: float) -> torch.Tensor:
 @pytest.mark.parametrize("stance", [HANDSTAND, FOOTSTAND])
 def test_the_stance_at_rest_earns_all_and_costs_nothing(stance):
     found = terms(stance)
-    earned = {"height": 1.0, "orientation": 1.0, "stillness": 1.0}
+    earned = {"height": 1.0, "orientation": 1.0, "stillness": 1.0, "held": 1.0}
     costs = {name: 0.0 for name in found if name not in earned}
     assert found == pytest.approx(earned | costs, abs=1e-9)
     assert set(found) == {field.name for field in fields(RewardCfg)} - {"termination", "pace"}
@@ -69,6 +69,12 @@ def test_stillness_is_height_and_orientation_at_rest():
     assert terms(x=fast)["stillness"] == pytest.approx(math.exp(-1) * math.exp(-1 - 0.4))
     strict = replace(ONES, pace=0.5)
     assert terms(x=fast, cfg=strict)["stillness"] == pytest.approx(math.exp(-1) * math.exp(-4 - 0.4))
+
+
+@pytest.mark.parametrize(("lean", "held"), [(0.0, 1.0), (19.0, 1.0), (21.0, 0.0)])
+def test_held_is_earned_up_to_a_lean_of_20_degrees(lean, held):
+    half = math.radians(90 - lean) / 2
+    assert terms(x=moved(x3=math.cos(half), x5=math.sin(half)))["held"] == held
 
 
 def test_free_feet_on_the_ground_are_counted():

@@ -33,16 +33,18 @@ class EffortCfg:
 
 @dataclass(frozen=True)
 class RewardCfg(EffortCfg):
-    """Weight of each term, those of `EffortCfg` too; the first three earn, the others cost.
+    """Weight of each term, those of `EffortCfg` too; the first four earn, the others cost.
 
     Height, orientation and the costs follow MuJoCo Playground's Go1 handstand task, with the contact
-    term as intended there (the two free feet); stillness and free-leg posture are ours.
+    term as intended there (the two free feet); stillness, held and free-leg posture are ours.
 
     Attributes:
         height: exp(-max(0, target - z) / 0.1), z the base height [m].
         orientation: ((1 + cos tilt) / 2)^2.
         stillness: height x orientation x exp(-|v / pace|^2 - 0.1 |omega|^2), v [m/s], omega [rad/s].
         pace: speed at which stillness has fallen to 1 / e [m/s].
+        held: 1 where the stance is held as it is measured, see `Stance.held`; height and orientation alone
+            hardly tell a lean of 20 degrees from none.
         contact: number of free feet on the ground.
         posture: sum of squared deviations of the free legs from the stance's pose [rad^2].
         stance_posture: the same for the supporting legs.
@@ -53,6 +55,7 @@ class RewardCfg(EffortCfg):
     orientation: float = 1.0
     stillness: float = 0.5
     pace: float = 1.0
+    held: float = 0.0
     contact: float = 0.3
     posture: float = 0.1
     stance_posture: float = 0.05
@@ -99,6 +102,7 @@ def stage_rewards(
         "height": cfg.height * height,
         "orientation": cfg.orientation * orientation,
         "stillness": cfg.stillness * height * orientation * still,
+        "held": cfg.held * stance.held(x, gap).to(x.dtype),
         "contact": -cfg.contact * (gap["foot"][:, stance.swing] < 0.005).sum(1),
         "posture": -cfg.posture * off[:, stance.free[0] // 2],
         "stance_posture": -cfg.stance_posture * off[:, stance.support[0] // 2],
