@@ -9,9 +9,11 @@ import numpy as np
 
 from deploy.codec import FrameError, RobotState, decode_state
 from deploy.settings import InputCfg
+from deploy.timing import Silence
 from hmc.go2.network import LOWER, UPPER
 
 _WRAP = 2**32
+_LOOK = 0.01  # s between two looks for frames, at most, while the machine does not stand still
 _RESTART = 1000  # ms that the robot's clock may seem to go back before the robot has restarted
 # numbers of a state, in order, and where each ends among all
 _NAMES = ("attitude", "gyroscope", "accelerometer", "joints", "joint speeds", "torques")
@@ -24,7 +26,6 @@ class StateChecks:
     Attributes:
         counts: frames by what was wrong with them, and "gap" for the frames that never came.
         ms: the robot's clock at the last good frame, without its overflow [ms].
-        heard: when that came [s]; -inf before the first.
 
     Args:
         cfg: limits.
@@ -34,7 +35,7 @@ class StateChecks:
         self.cfg = cfg
         self.counts: Counter[str] = Counter()
         self.ms = 0
-        self.heard = -math.inf
+        self._silence = Silence(cfg.max_age, cfg.stall, _LOOK)
         self._fault = ""
         self._last = ""
         margin = (UPPER - LOWER) / 2 + cfg.joint_margin
@@ -43,6 +44,11 @@ class StateChecks:
         self._width = np.concatenate(widths)
         self._middle = np.zeros(len(self._width))
         self._middle[10:22] = (UPPER + LOWER) / 2
+
+    @property
+    def heard(self) -> float:
+        """When the last good frame came [s]; -inf before the first."""
+        return self._silence.heard
 
     def take(self, frame: bytes, now: float) -> RobotState | None:
         """The state in a frame that came `now` [s], or None if it is not believed."""
@@ -62,7 +68,7 @@ class StateChecks:
         else:
             self.counts["gap"] += ahead // 2 - 1
             self.ms += ahead
-        self.heard = now
+        self._silence.hear(now)
         if (hottest := int(state.temperature.max())) > self.cfg.temperature:
             self._fault = f"a motor has {hottest} deg C, allowed are {self.cfg.temperature:g}: let it cool"
         return state
@@ -71,7 +77,7 @@ class StateChecks:
         """Why the robot cannot be believed any more; "" while it can."""
         if self._fault:
             return self._fault
-        if now - self.heard <= self.cfg.max_age:
+        if not self._silence.too_long(now):
             return ""
         age = f"for {1e3 * (now - self.heard):.0f} ms" if math.isfinite(self.heard) else "yet"
         last = f" (the last one refused: {self._last})" if self._last else ""

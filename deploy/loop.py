@@ -258,7 +258,8 @@ def policies(foot: str, hand: str) -> dict[int, Network]:
 def run(job: Job, stopped: Callable[[], bool]) -> None:
     """Control the robot until `stopped()`."""
     cfg = load(job.cfg, DeployCfg, job.set)
-    cfg = replace(cfg, input=replace(cfg.input, max_age=cfg.input.max_age / job.speed))
+    slow = replace(cfg.input, max_age=cfg.input.max_age / job.speed, stall=cfg.input.stall / job.speed)
+    cfg = replace(cfg, input=slow)
     control = Control(cfg, policies(job.foot, job.hand))
     quick = real_time(PRIORITY)
     link = Link(job.domain, job.interface)

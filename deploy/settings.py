@@ -10,7 +10,9 @@ class InputCfg:
     """What a state frame has to be like.
 
     Attributes:
-        max_age: without a good frame for longer, the robot is damped [s].
+        max_age: without a good frame for longer, the robot is damped [s]; time in which the control process
+            stood still itself counts hardly.
+        stall: without one for longer it is in any case [s].
         gyro: largest reading [rad/s].
         acc: largest reading [m/s^2].
         joint_margin: how far an encoder may read beyond a joint's limits [rad].
@@ -21,6 +23,7 @@ class InputCfg:
     """
 
     max_age: float = 0.06
+    stall: float = 0.2
     gyro: float = 35.0
     acc: float = 157.0
     joint_margin: float = 0.35

@@ -1,7 +1,8 @@
-"""How late the control steps are, by the robot's clock; and whether the machine had its cores for itself."""
+"""How late the control steps are, how long nothing was heard, and who else had the machine's cores."""
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections import deque
 from pathlib import Path
@@ -36,6 +37,38 @@ class Lateness:
     def __len__(self) -> int:
         """How many ticks."""
         return sum(self.bins)
+
+
+class Silence:
+    """Whether something has been silent for too long, counted in looks.
+
+    A time in which nobody looked counts as `step`. When the whole machine stood still, what was to be heard
+    did so, too, and gets the time that it has otherwise.
+
+    Attributes:
+        heard: when it was heard last [s]; -inf before the first time.
+
+    Args:
+        allowed: silence that is not too long [s].
+        most: nor is one of no more than this with what was not looked at [s].
+        step: what counts of the time between two looks, at most [s].
+    """
+
+    def __init__(self, allowed: float, most: float, step: float):
+        self.heard = self._looked = -math.inf
+        self._allowed, self._most, self._step = allowed, most, step
+        self._counted = 0.0
+
+    def hear(self, t: float) -> None:
+        """It was heard at t [s]."""
+        self.heard, self._counted = t, 0.0
+
+    def too_long(self, now: float) -> bool:
+        """Whether it is, looking `now` [s]."""
+        age = now - self.heard
+        self._counted = min(self._counted + min(now - self._looked, self._step), age)
+        self._looked = now
+        return self._counted > self._allowed or age > self._most
 
 
 class Stolen:

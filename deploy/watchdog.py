@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import select
 import time
@@ -16,6 +15,7 @@ from deploy.messages import LowCmd_
 from deploy.process import Job, real_time, told, until_told
 from deploy.settings import DeployCfg, WatchdogCfg
 from deploy.slots import Board, text
+from deploy.timing import Silence
 from hmc.cfg import load
 
 PRIORITY = 60
@@ -30,9 +30,6 @@ def damping(gain: float) -> bytes:
 class Watchdog:
     """Looks at the control process, and latches.
 
-    Silence is counted in looks: when the whole machine stood still, the watchdog with it, the control process
-    gets the time to beat that it has otherwise, up to `stall`.
-
     Attributes:
         reason: why the robot is damped; "" while it is not.
 
@@ -43,9 +40,8 @@ class Watchdog:
 
     def __init__(self, board: Board, cfg: WatchdogCfg):
         self.reason = ""
-        self._board, self._cfg = board, cfg
-        self._beat = self._looked = -math.inf  # time of the last heartbeat and look [s]
-        self._silent = 0.0  # since that heartbeat, as far as it was looked [s]
+        self._board = board
+        self._silence = Silence(cfg.hang, cfg.stall, 2 * cfg.period)
 
     def look(self, gone: bool, now: float) -> bool:
         """Whether the robot is to be damped.
@@ -57,15 +53,12 @@ class Watchdog:
         heart = self._board.heart.read()
         # a control process that has commanded nothing yet leaves the robot as it is
         if not self.reason and heart is not None and heart["commanding"]:
-            age = now - float(heart["t"])
-            if heart["t"] != self._beat:
-                self._beat, self._silent = float(heart["t"]), 0.0
-            self._silent += min(age - self._silent, now - self._looked, 2 * self._cfg.period)
+            if heart["t"] != self._silence.heard:
+                self._silence.hear(float(heart["t"]))
             if gone:
                 self.reason = "the control process ended"
-            elif self._silent > self._cfg.hang or age > self._cfg.stall:
-                self.reason = f"the control process hung for {1e3 * age:.0f} ms"
-        self._looked = now
+            elif self._silence.too_long(now):
+                self.reason = f"the control process hung for {1e3 * (now - self._silence.heard):.0f} ms"
         guard = self._board.guard.blank()
         guard["t"], guard["pid"] = now, os.getpid()
         guard["latched"], guard["reason"] = bool(self.reason), text(self.reason)

@@ -208,11 +208,25 @@ def test_a_bad_frame_is_dropped_counted_and_many_are_a_fault(reason):
     assert checks.take(good(100), 1.0) is not None
     assert checks.take(BAD[reason](102), 1.002) is None
     assert checks.counts[reason] == 1
-    assert checks.fault(1.05) == ""
-    assert checks.fault(1.07) == f"no good state frame for 70 ms (the last one refused: {reason})"
+    assert [checks.fault(1.002 + 0.002 * k) for k in range(25)] == [""] * 25
+    last = [checks.fault(1.052 + 0.002 * k) for k in range(10)][-1]
+    assert last == f"no good state frame for 70 ms (the last one refused: {reason})"
     assert checks.take(good(110), 1.1) is not None
     assert checks.counts["gap"] == 4
     assert checks.fault(1.1) == ""
+
+
+def test_a_pause_of_the_whole_machine_is_no_fault():
+    """Frames of the robot come after it, before one counts as silent; but not after any time."""
+    checks = StateChecks(InputCfg(max_age=0.06, stall=0.2))
+    assert checks.take(good(100), 1.0) is not None
+    assert checks.fault(1.005) == ""
+    assert [checks.fault(1.12 + 0.005 * k) for k in range(8)] == [""] * 8
+    assert checks.take(good(102), 1.16) is not None
+    assert checks.fault(1.30) == ""
+    assert [checks.fault(1.30 + 0.005 * k) for k in range(12)][-1] != "", "and nothing came"
+    assert checks.take(good(104), 2.0) is not None
+    assert checks.fault(2.21) == "no good state frame for 210 ms"
 
 
 def test_the_robots_clock_overflows_and_restarts():

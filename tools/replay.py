@@ -80,7 +80,7 @@ def replay(path: Path) -> Replay:
     Raises:
         LogError: not a log of this version.
     """
-    checks, estimator = StateChecks(InputCfg(max_age=np.inf)), Estimator()
+    checks, estimator = StateChecks(InputCfg(max_age=np.inf, stall=np.inf)), Estimator()
     ticks: list[dict[str, Any]] = []
     again: dict[int, np.ndarray] = {}
     for topic, _, content in read(path):
