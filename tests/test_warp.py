@@ -22,7 +22,7 @@ from hmc.go2.model import SUBSTEPS, load_model
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import FlipCfg, JumpCfg, flip_task
 from hmc.go2.variants import Variant
-from hmc.sim import cuda
+from hmc.sim import cuda, warp
 from hmc.sim.make import installed, make_sim
 from hmc.sim.warp import WarpSim
 
@@ -97,6 +97,25 @@ def test_standing_robots(device, request):
     assert sim.overflow() == {"constraints": 0, "contacts": 0}
 
 
+@pytest.mark.parametrize("fallback", [(False, False), (True, False)])
+def test_graphs_are_the_steps_that_they_recorded(monkeypatch, fallback):
+    """Of worlds with models and latencies of their own, in workspaces of all sizes, made as they are needed,
+    to the bit as where a driver has no graphs, or none with loops."""
+    states, models = [], [Variant(friction=0.5 + 0.1 * i, payload=0.3 * i).model() for i in range(5)]
+    for found in ((True, True), fallback):
+        monkeypatch.setattr(warp, "graphs", lambda device, found=found: found)
+        sim = WarpSim(load_model(), 5, device="cpu", latency=(0, 1, 2, 3, 4), models=models)
+        generator = torch.Generator().manual_seed(3)
+        sim.reset(standing()[:5], TALL.repeat(5, 1))
+        for n in (5, 1, 3, 5, 2, 5, 4):
+            ids = torch.randperm(5, generator=generator)[:n]
+            sim.step(TALL + 0.2 * torch.randn(n, 12, generator=generator), ids)
+        states.append(sim.save())
+        assert all((space._graph is not None) == found[0] for space in sim._spaces.values())
+    assert torch.equal(*states)
+    assert states[0].isfinite().all()
+
+
 def test_other_models_are_checked():
     model = load_model()
     longer = load_model()
@@ -137,7 +156,7 @@ def fake_gpu(monkeypatch, *, warp: bool = True, pools: bool = True, loops: bool 
 
 
 def test_drivers(monkeypatch, capsys):
-    assert cuda.graphs(torch.device("cpu")) == (False, False)
+    assert cuda.graphs(torch.device("cpu")) == (True, True)
     assert cuda.graphs(fake_gpu(monkeypatch)) == (True, True)
     with pytest.warns(UserWarning, match=r"CUDA 12\.2\) lacks loops .* 12\.4; the contact solver") as said:
         assert cuda.graphs(fake_gpu(monkeypatch, loops=False)) == (True, False)

@@ -1,9 +1,11 @@
-"""What a GPU must have for engine warp: drivers, graphs, memory. What lacks is said in one line."""
+"""What engine warp needs of a device: drivers, graphs, memory. What lacks is said in one line."""
 
 from __future__ import annotations
 
 import dataclasses
+import gc
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,13 +17,13 @@ from hmc.sim.device import free_memory
 def graphs(device: torch.device) -> tuple[bool, bool]:
     """Whether steps can be captured as graphs on a device, and whether these can hold loops.
 
-    A warning says what is slower where they cannot. A CPU has neither and needs neither.
+    A warning says what is slower where they cannot. Warp's CPU device has graphs, too.
 
     Raises:
         ValueError: torch has this GPU and Warp has not.
     """
     if device.type == "cpu":
-        return False, False
+        return True, True
     if not wp.is_cuda_available():
         raise ValueError(
             f"engine warp: torch finds {device} but Warp {wp.config.version} does not, its CUDA "
@@ -40,6 +42,25 @@ def graphs(device: torch.device) -> tuple[bool, bool]:
             stacklevel=3,
         )
     return captured, loops
+
+
+def capture(work: Callable[[], None], device: Any) -> Any:
+    """A graph of all that `work` launches on a device of Warp's, for `warp.capture_launch` on any stream.
+
+    `work` runs once before it is recorded, because its kernels are compiled and loaded then. What it makes
+    lives as long as the graph; arrays that it is to find again must not move.
+    """
+    work()
+    wp.synchronize_device(device)
+    collecting = gc.isenabled()
+    gc.disable()  # what it collects may free memory of the device, which is not allowed during a capture
+    try:
+        with wp.ScopedCapture(device) as captured:
+            work()
+    finally:
+        if collecting:
+            gc.enable()
+    return captured.graph
 
 
 def check_memory(one: Any, worlds: int, device: torch.device) -> None:

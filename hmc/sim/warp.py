@@ -1,9 +1,8 @@
-"""The GPU engine: MuJoCo Warp, thousands of worlds in captured CUDA graphs; its CPU device for parity."""
+"""The GPU engine: MuJoCo Warp, thousands of worlds in captured graphs; its CPU device for parity."""
 
 from __future__ import annotations
 
 import copy
-import gc
 import warnings
 from collections.abc import Sequence
 from itertools import accumulate
@@ -15,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from hmc.sim.check import check, check_latency
-from hmc.sim.cuda import check_memory, graphs, num_bytes
+from hmc.sim.cuda import capture, check_memory, graphs, num_bytes
 from hmc.sim.device import find_device
 from hmc.sim.ids import Ids, count, fresh, where
 from hmc.sim.variety import own_values
@@ -62,7 +61,7 @@ class WarpSim:
 
     x is qpos then qvel, u is ctrl, all float32 on `device`. Worlds live as rows of one torch tensor, so
     that save, load and reset are indexing on the device. A step copies the rows it is about into a
-    workspace, runs the substeps there (on a GPU: one captured graph) and copies them back; 70 floats a
+    workspace, runs the substeps there (one captured graph) and copies them back; 70 floats a
     world for the Go2, against some 30,000 that a substep touches. A step of n of the W worlds uses the
     smallest workspace that holds n, one of W, W/2, W/4, ... worlds (made at first use), so that it costs
     at most twice the step of n worlds, and all workspaces together at most twice the memory.
@@ -74,8 +73,8 @@ class WarpSim:
     model can make at once, so that this happens only to sizes set by hand.
 
     Results on a GPU depend on the order in which threads finish, unless `deterministic`; on Warp's CPU
-    device they are exact. That device is for parity tests: 8 times slower than one thread of the
-    C engine at 256 worlds, 150 times at 5.
+    device they are exact. That device is for parity tests: 4 to 5 times slower than one thread of the
+    C engine, at any number of worlds.
 
     Attributes:
         contacts: room for contacts, per world but pooled over the worlds of a workspace.
@@ -127,8 +126,7 @@ class WarpSim:
         with wp.ScopedDevice(self._on_warp), warnings.catch_warnings(action="ignore"):
             self._params = mjw.put_model(self.model)  # its warning about drivers is several lines long
         self._params.opt.warn_overflow = 0  # counted below instead of printed by the device
-        if self._device.type == "cuda":
-            self._params.opt.graph_conditional = loops
+        self._params.opt.graph_conditional = loops
         if deterministic is None:
             deterministic = torch.are_deterministic_algorithms_enabled()
         if deterministic and self._device.type == "cuda":
@@ -273,19 +271,20 @@ class Workspace:
         self._params, self._data, self._device = params, data, device
         self._substeps, self._arrivals, self._captured = substeps, arrivals, captured
         size = data.nworld
-        self._views = {name: wp.to_torch(getattr(data, name)).reshape(size, -1) for name in FIELDS}
+        self._views = {name: wp.to_torch(getattr(data, name)).view(size, -1) for name in FIELDS}
         self.slices = slices(self._views)
         with wp.ScopedDevice(device):
             self._late, self._inputs = wp.zeros(size, dtype=float), wp.zeros_like(data.ctrl)
         # as in a row of what a world has of its own
         self._own = {"late": wp.to_torch(self._late)[:, None]}
         for name in varied:
-            self._own[name] = wp.to_torch(getattr(params, name)).reshape(size, -1)
+            self._own[name] = wp.to_torch(getattr(params, name)).view(size, -1)
         self._own_slices = slices(self._own)
         self._u = wp.to_torch(self._inputs)
         self.force = wp.to_torch(data.actuator_force)
         self.overflow = wp.to_torch(data.overflow)
         self._graph: Any = None
+        wp.synchronize_device(device)  # Warp filled these on a stream of its own, torch writes on another
 
     def write(self, rows: Tensor, own: Tensor, u: Tensor) -> None:
         """Take rows (n, ns), what their worlds have of their own (n, no), and inputs (n, nu).
@@ -306,11 +305,9 @@ class Workspace:
         return torch.cat(list(self._views.values()), dim=1)
 
     def run(self) -> None:
-        """One control step."""
-        if not self._device.is_cuda:
-            self._substep_all()
-            return
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.force.device))  # no waiting in between
+        """One control step, on the stream that torch works on: nobody waits in between."""
+        cuda = self._device.is_cuda
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.force.device)) if cuda else None
         if not self._captured:
             with wp.ScopedStream(stream):
                 self._substep_all()
@@ -330,16 +327,9 @@ class Workspace:
     def _capture(self) -> None:
         """Record the substeps once; the state they start from is put back."""
         rows = self.read()
-        torch.cuda.synchronize(rows.device)
-        self._substep_all()  # kernels are compiled and loaded outside of the capture
-        wp.synchronize_device(self._device)
-        gc.disable()  # freeing device memory is not allowed during a capture
-        try:
-            with wp.ScopedCapture(self._device) as capture:
-                self._substep_all()
-        finally:
-            gc.enable()
-        self._graph = capture.graph
+        if self._device.is_cuda:
+            torch.cuda.synchronize(rows.device)  # Warp records on a stream of its own
+        self._graph = capture(self._substep_all, self._device)
         for name, view in self._views.items():
             view[:] = rows[:, self.slices[name]]
         self.overflow.zero_()

@@ -21,7 +21,7 @@ from hmc.go2.model import HOME, Q_LOWER, Q_UPPER, SUBSTEPS, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, jump_mode, policy_path
 from hmc.memory import make_worlds
-from hmc.sim.cuda import num_bytes
+from hmc.sim.cuda import capture, graphs, num_bytes
 from hmc.sim.device import devices
 from hmc.sim.make import make_sim
 from hmc.sim.warp import WarpSim
@@ -117,7 +117,7 @@ def listed(args: Gpu) -> dict[str, str]:
 
 
 class Bare:
-    """mujoco_warp alone, with a simulator's model and sizes: its step, captured where that can be."""
+    """mujoco_warp alone, with a simulator's model, sizes and driver: its step, captured where that can be."""
 
     def __init__(self, sim: WarpSim):
         self.device = wp.device_from_torch(sim.device)
@@ -128,13 +128,9 @@ class Bare:
             )
         self.model.opt.warn_overflow = 0
         self.qpos, self.qvel = wp.to_torch(self.data.qpos), wp.to_torch(self.data.qvel)
-        self.ctrl, self.graph = wp.to_torch(self.data.ctrl), None
-        if self.device.is_cuda:
-            self._substeps()  # kernels are compiled and loaded outside of the capture
-            wp.synchronize_device(self.device)
-            with wp.ScopedCapture(self.device) as capture:
-                self._substeps()
-            self.graph = capture.graph
+        self.ctrl = wp.to_torch(self.data.ctrl)
+        captured, self.model.opt.graph_conditional = graphs(sim.device)
+        self.graph = capture(self._substeps, self.device) if captured else None
 
     def reset(self, x: Tensor) -> None:
         """Begin at states (W, nx)."""
@@ -146,11 +142,12 @@ class Bare:
     def step(self, u: Tensor) -> None:
         """One control step."""
         self.ctrl[:] = u
-        if self.graph is None:
-            self._substeps()
+        stream = wp.stream_from_torch(torch.cuda.current_stream(u.device)) if u.is_cuda else None
+        if self.graph is not None:
+            wp.capture_launch(self.graph, stream=stream)
             return
-        stream = torch.cuda.current_stream(u.device)
-        wp.capture_launch(self.graph, stream=wp.stream_from_torch(stream))
+        with wp.ScopedStream(stream):
+            self._substeps()
 
     def _substeps(self) -> None:
         with wp.ScopedDevice(self.device):
