@@ -7,7 +7,8 @@ from hmc.sim.base import Sim
 from hmc.sim.device import free_memory
 from hmc.task import Task
 
-SHARE = 0.9  # of what a device has free: drivers and allocators want some of it
+# Of what a device has free: drivers and allocators want some of it, and steps priced at once some 10 MiB.
+SHARE = 0.9
 # Bytes that a step works with for a world: copies of its row, what its mode and its cost come to on the way.
 # All that a policy of the Go2 and its cost ever make in a step is 13 KiB; other modes may take more.
 WORKING = 32 * 1024

@@ -19,7 +19,7 @@ from hmc.trace import Floats, Recorder, Traces
 from hmc.worlds import Crew, Flags, Indices, Worlds, finite
 
 ROWS, STEPS = 256, 8  # of states that are priced in one call, at most
-CHEAP_ROWS = 8192  # where a control step takes less time than such a call
+MANY_ROWS = 8192  # where a control step takes less time than such a call, or than to wait for what it finds
 RECORDED = 64  # branches that are all recorded, at most
 
 
@@ -137,11 +137,12 @@ class _Rollout:
         # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost
         self.later = far(self.sim.device) and not watchful and self.stages > 0
         self.constant = task.modes.constants is not None
-        self.rows = CHEAP_ROWS if self.cheap else ROWS
+        self.rows = MANY_ROWS if self.cheap or self.later else ROWS
         # what steps cost can wait where nothing is given up for it
         patient = self.limit == math.inf and not self.later
         self.at_once = 1 if watchful else self.rows if patient else STEPS
-        self.before_births = not (self.cheap or patient)  # what is beyond its limit has no children
+        # what is beyond its limit has no children, where to find out takes less time than to step those
+        self.before_births = not (self.cheap or self.later or patient)
 
     def advance(self, i: int) -> None:
         """Step i of all branches that go on: what is born then, and their end at i = T, included."""

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from hmc import Evaluator, make_start, rollout
+from hmc import Cost, Evaluator, make_start, rollout
 from hmc.sampling import METHODS
 from tests.test_sampling import mode, situations
-from tests.toy import Bad, Damp, Push, all_schedules, toy_task
+from tests.toy import COST, Bad, Damp, Push, all_schedules, toy_task
 
 WAITING = {"_local_scalar_dense", "nonzero", "_unique2", "unique_dim", "masked_select", "equal", "is_nonzero"}
 X = [0.4, -0.2]
@@ -72,6 +72,35 @@ def test_no_step_waits_but_for_costs(monkeypatch):
     assert here[1] - here[0] == 2 * 2, "states and inputs of each step"
     monkeypatch.setattr(rollout, "far", lambda device: True)
     assert waits_of(4) == waits_of(6) == here[0] - 2 * 4
+
+
+@pytest.mark.parametrize(("horizon", "share"), [(5, 1.0), (9, 1.0), (9, 0.1), (9, 0.01)])
+def test_costs_are_waited_for_once_in_eight_steps(horizon, share, monkeypatch):
+    """What is beyond its bound goes on until then, and so do its children; nothing else changes."""
+    made: list[int] = []
+
+    def position(*given: torch.Tensor) -> torch.Tensor:
+        made.append(len(given[0]))
+        return COST.stage["position"](*given)
+
+    cost = Cost({**COST.stage, "position": position}, COST.terminal, nonnegative=True)
+    task, schedules = toy_task(horizon, [Push(1.0), Damp()], cost), all_schedules(2, horizon)
+
+    def found(bound: float) -> tuple[torch.Tensor, int]:
+        sim = task.make_sim(len(schedules))
+        evaluator = Evaluator(task, sim, make_start(task, sim, X))
+        made.clear()
+        costs = evaluator.costs(schedules, bound)
+        return costs, evaluator.own_steps
+
+    bound = float(found(math.inf)[0].quantile(share))
+    costs, steps = found(bound)
+    assert len(made) == horizon
+    monkeypatch.setattr(rollout, "far", lambda device: True)
+    later, more = found(bound)
+    assert torch.equal(costs, later)
+    assert len(made) == math.ceil(horizon / 8)
+    assert steps == more if share == 1 else steps < more
 
 
 @pytest.mark.parametrize("method", METHODS)
