@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hmc.sim.base import Sim
+from hmc.sim.device import constant
 
 
 class Mode(ABC):
@@ -90,7 +91,7 @@ class Motion(Mode):
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         step = memory[:, 0].long().clamp(max=len(self.inputs) - 1)
-        return self.inputs.to(x, non_blocking=True)[step], memory + 1
+        return constant(self.inputs, x)[step], memory + 1
 
 
 class ModeSet:

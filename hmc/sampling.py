@@ -348,7 +348,8 @@ class SamplingMpc(Mode):
             table.append(z)
         noise = torch.stack(table)
         if like is not None:
-            noise, inverse = noise.to(like, non_blocking=True), upload(inverse.numpy(), like.device)
+            noise, inverse = (upload(each.numpy(), like.device) for each in (noise, inverse))
+            noise = noise.to(like)
         return noise[inverse]
 
     def _rollout(self, x: Tensor, u: Tensor, plans: Tensor, k: Tensor) -> Tensor:

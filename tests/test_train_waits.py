@@ -138,8 +138,8 @@ def test_no_policy_cost_or_critic_waits():
     k = torch.zeros(5, dtype=torch.long, device=META)
 
     def step() -> None:
-        for mode in ("foot", "hand"):
-            task.modes[mode].act(x, u, task.modes[mode].reset(x, u, k), k)
+        for mode in task.modes:
+            mode.act(x, u, mode.reset(x, u, k), k)
         task.cost.stage_terms(x, u, u, k)
         task.cost.terminal_terms(x, k)
 

@@ -6,12 +6,14 @@ import math
 from collections import Counter
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from hmc import Cost, Evaluator, make_start, rollout
 from hmc.sampling import METHODS
+from hmc.sim.device import upload
 from tests.test_sampling import mode, situations
 from tests.toy import COST, Bad, Damp, Push, all_schedules, toy_task
 
@@ -101,6 +103,21 @@ def test_costs_are_waited_for_once_in_eight_steps(horizon, share, monkeypatch):
     assert torch.equal(costs, later)
     assert len(made) == math.ceil(horizon / 8)
     assert steps == more if share == 1 else steps < more
+
+
+def test_what_a_gpu_fetches_is_pinned(monkeypatch):
+    """From other memory it could not be fetched beside what the host does; a CPU has no use for that."""
+    done: list[Any] = []
+
+    def pinned(values: torch.Tensor) -> torch.Tensor:
+        done.append("pin")
+        return values
+
+    monkeypatch.setattr(torch.Tensor, "pin_memory", pinned)
+    monkeypatch.setattr(torch.Tensor, "to", lambda values, device, **how: done.append((device.type, how)))
+    for name in ("cuda:0", "cpu"):
+        upload(np.arange(3), torch.device(name))
+    assert done == ["pin", ("cuda", {"non_blocking": True}), ("cpu", {"non_blocking": True})]
 
 
 @pytest.mark.parametrize("method", METHODS)

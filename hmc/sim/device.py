@@ -43,11 +43,13 @@ def free_memory(device: torch.device) -> float:
 
 def upload(values: NDArray[Any], device: torch.device) -> Tensor:
     """An array as a tensor on a device, without waiting for what the device has to do before it."""
-    return torch.from_numpy(values).to(device, non_blocking=True)
+    found = torch.from_numpy(values)
+    # a GPU fetches from pinned memory by itself; what lies elsewhere the host hands over, and may wait for it
+    return (found.pin_memory() if device.type == "cuda" else found).to(device, non_blocking=True)
 
 
 def constant(values: Tensor, like: Tensor) -> Tensor:
-    """A module's constant in the type and on the device of another tensor, copied there once.
+    """A module's or an object's constant in the type and on the device of another tensor, copied there once.
 
     Each copy to a GPU waits until that has done what it was told before. `values` is to be the same
     object at every call.
