@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import subprocess
 import sys
 
@@ -254,6 +255,48 @@ def test_pictures_of_a_strip():
     assert max(strip_steps(flip[:45], 9)) == 44
     assert strip_steps(["handstand"] * 101, 5) == [0, 25, 50, 75, 100]
     assert strip_steps(["getup"] * 50 + ["foot"] * 51, 5) == [0, 25, 50, 75, 100]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "CUDA out of memory. Tried to allocate 2 GiB",
+        "Failed to allocate 64 bytes on device 'cuda:0'",
+        "other",
+    ],
+)
+def test_memory_that_is_used_up(tmp_path, monkeypatch, words):
+    """What learning takes is known only then; other errors stay what they are."""
+    runner = make_runner(tmp_path)
+    runner.last_iteration = 1
+
+    def used_up(actions):
+        raise RuntimeError(words)
+
+    monkeypatch.setattr(runner.env, "step", used_up)
+    if words == "other":
+        with pytest.raises(RuntimeError, match="other"):
+            ppo.train(runner, tmp_path)
+        return
+    with pytest.raises(
+        SystemExit, match=r"^error: cpu has no memory left for 8 worlds .* env\.worlds=4, with"
+    ):
+        ppo.train(runner, tmp_path)
+
+
+def test_what_trains_is_said(capsys, monkeypatch, tmp_path):
+    """And why it is the CPU's, where nobody asked for that."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(ppo, "set_up", lambda args: make_runner(tmp_path))
+    monkeypatch.setattr(ppo, "train", lambda runner, folder: None)
+    for given, rest in (
+        ({}, r": there is only cpu \(.*\)"),
+        ({"engine": "mujoco"}, ""),
+        ({"device": "cpu"}, ""),
+    ):
+        ppo.main(ppo.Args("handstand", **given))
+        said = capsys.readouterr().out.strip()
+        assert re.fullmatch("engine mujoco, 8 worlds on cpu" + rest, said)
 
 
 def test_torchrun_without_a_gpu(capsys, monkeypatch):

@@ -17,7 +17,10 @@ import torch  # noqa: E402
 import tyro  # noqa: E402
 
 from hmc.cli import one_line_errors  # noqa: E402
+from hmc.sim.device import devices, used_up  # noqa: E402
+from hmc.sim.make import choose  # noqa: E402
 from train.config import metadata, read_training, rsl_config  # noqa: E402
+from train.env import Go2Env  # noqa: E402
 from train.make import make_env  # noqa: E402
 from train.runner import Runner  # noqa: E402
 
@@ -139,9 +142,25 @@ def train(runner: Runner, folder: Path) -> None:
             done = runner.save_interrupted()
             note = f"go on with --resume (checkpoint in {folder})" if done else "nothing was learned yet"
             say(f"stopped; {note}")
+        except RuntimeError as error:
+            if not used_up(error):
+                raise
+            env = runner.env
+            raise SystemExit(
+                f"error: {env.device} has no memory left for {env.num_envs:,} worlds and learning from "
+                f"them: take --set env.worlds={env.num_envs // 2}, with --resume from the last checkpoint on"
+            ) from None
         finally:
             if not alone:
                 torch.distributed.destroy_process_group()
+
+
+def engine_in_words(args: Args, env: Go2Env) -> str:
+    """What steps how many worlds where; where it was to be chosen, also why it is not the GPU's."""
+    engine, _ = choose(args.engine, env.device)
+    open_to_all = args.engine == args.device == "auto"
+    why = f": {devices()}" if open_to_all and env.device.type == "cpu" else ""
+    return f"engine {engine}, {env.num_envs:,} worlds on {env.device}{why}"
 
 
 def main(args: Args) -> None:
@@ -154,6 +173,8 @@ def main(args: Args) -> None:
         return
     with one_line_errors():
         runner = set_up(args)
+    if runner.gpu_global_rank == 0:
+        print(engine_in_words(args, runner.env))
     train(runner, args.folder)
 
 

@@ -41,6 +41,11 @@ def free_memory(device: torch.device) -> float:
     return float("inf") if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
 
 
+def used_up(error: RuntimeError) -> bool:
+    """Whether an error says that a device has no memory left; torch and Warp each have words of their own."""
+    return any(words in str(error) for words in ("out of memory", "Failed to allocate"))
+
+
 def upload(values: NDArray[Any], device: torch.device) -> Tensor:
     """An array as a tensor on a device, without waiting for what the device has to do before it."""
     found = torch.from_numpy(values)
