@@ -163,7 +163,7 @@ def plan(
     ran: int | None = None,
     schedule: Sequence[int | str] | None = None,
     solver: str = "sample",
-    samples: int = 64,
+    samples: int | None = None,
     max_samples: int = 0,
     order: str = "uniform",
     pairs: int = 0,
@@ -199,7 +199,8 @@ def plan(
         schedule: the incumbent, T modes by index or name; by default `mode` (else mode 0) throughout.
         solver: "sample" (Algorithms 1 and 2) takes the best of the first batch that improves; "exhaustive"
             (Algorithm 1) evaluates all of Omega and takes the best.
-        samples: N, switches drawn a batch.
+        samples: N, switches drawn a batch; left out, 64, or where the solver is "exhaustive" all of Omega.
+            What does not fit into the memory at once is rolled out in parts.
         max_samples: the batches of one iteration double up to this size, since many at once are cheaper each;
             0 for N throughout.
         order: of "sample"'s draws: "uniform", as Theorem 2 has it, or "tails": the switches that last to
@@ -216,7 +217,7 @@ def plan(
         progress: called with the plan so far after every batch and accepted switch; False stops.
         sim: simulator to plan in, made with `task.make_sim`; made anew if left out.
         room: bytes that the worlds made then may take, see `hmc.memory`; None for what a GPU has free, on a
-            CPU for any. What does not fit at once is rolled out in parts.
+            CPU for any.
         forget: let modes drop what they kept from earlier searches. A receding loop keeps it: then what
             a budget of control steps reaches depends on the ticks before.
         known: `Plan.known` of an earlier plan of this task, cut to where this one begins (`Trace.since`): if
@@ -228,6 +229,7 @@ def plan(
     """
     _known("solver", solver, SOLVERS)
     _known("order", order, ORDERS)
+    samples = batch_of(task, solver, samples)
     _check(samples, max_samples, pairs, moves, iterations, tolerance)
     if sim is None:
         sim = make_worlds(task, worlds_for(task, samples, max_samples, pairs + moves), room)
@@ -272,6 +274,13 @@ def plan(
     for used in (search.evaluator.sim, *(sim for each in task.modes for sim in each.sims)):
         tell_overflow(used)
     return _plan(search, incumbent)
+
+
+def batch_of(task: Task, solver: str, samples: int | None) -> int:
+    """N: what was asked for, else 64, or all of Omega for a solver that evaluates all of it."""
+    if samples is not None:
+        return samples
+    return len(SwitchSpace(len(task.modes), task.horizon)) if solver == "exhaustive" else 64
 
 
 def worlds_for(task: Task, samples: int, max_samples: int, beside: int) -> int:

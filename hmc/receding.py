@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hmc.budget import Budget
 from hmc.memory import make_worlds
-from hmc.planner import Plan, Progress, plan, worlds_for
+from hmc.planner import Plan, Progress, batch_of, plan, worlds_for
 from hmc.running import Running
 from hmc.sim.base import Sim
 from hmc.start import Vector, make_start
@@ -102,7 +102,7 @@ class Receding:
         sim: Sim | None = None,
         room: float | None = None,
         solver: str = "sample",
-        samples: int = 64,
+        samples: int | None = None,
         max_samples: int = 0,
         order: str = "uniform",
         pairs: int = 0,
@@ -113,6 +113,7 @@ class Receding:
         progress: Progress | None = None,
     ):
         self.task, self.seed, self.k, self.schedule = task, seed, k, schedule
+        samples = batch_of(task, solver, samples)
         wanted = worlds_for(task, samples, max_samples, pairs + moves)
         self.sim = sim if sim is not None else make_worlds(task, wanted, room)
         self.running = Running(task.modes)

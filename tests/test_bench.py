@@ -122,7 +122,7 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         targets = {name for name in (*AT_LEAST, *AT_MOST) if re.search(r"_(4096|8192|t75)", name)}
         missing = {name for name, value in written.items() if value == "not measured"}
         assert len(targets) == 6
-        assert targets | {"step_8192_bare_steps_per_s", "crossover_switches"} <= missing
+        assert targets | {"step_8192_bare_steps_per_s", "crossover_c1_switches"} <= missing
         assert said.count("not measured") == len(missing)
 
 

@@ -77,6 +77,18 @@ def test_the_same_plan_in_parts(solver):
     assert Receding(toy_task(HORIZON), samples=45, room=FIXED + 3.5 * EACH).sim.num_worlds == 3
 
 
+def test_an_exact_search_takes_all_that_fits():
+    """All of Omega at once, and the schedule that it goes out from; the best does not depend on that."""
+    sizes: list[int] = []
+    whole = plan(counted(sizes), X, solver="exhaustive")
+    assert sizes[-1] == 45 + 1
+    parts = plan(counted(sizes), X, solver="exhaustive", room=FIXED + 10.5 * EACH)
+    assert sizes[-1] == 10
+    assert parts == whole == plan(counted(sizes), X, solver="exhaustive", samples=4)
+    assert Receding(toy_task(HORIZON), solver="exhaustive").sim.num_worlds == 46
+    assert Receding(toy_task(HORIZON)).sim.num_worlds == 46, "no more than 45 of the 64"
+
+
 def test_a_world_on_engine_warp():
     """Against the arrays of all workspaces that steps of any number of worlds make."""
     sim: Any = WarpSim(load_model(), 7, device="cpu", substeps=1)

@@ -111,9 +111,16 @@ def listed(args: Gpu) -> dict[str, str]:
     found[f"{search}_ms"] = "the single-switch problem solved exactly [ms]"
     found[f"{search}_candidates_per_s"] = "schedules a second"
     found[f"{search}_efficiency"] = "physics steps/s of the search over the bare engine's"
-    found["crossover_switches"] = "the smallest batch that takes less time than on the C engine's threads"
+    for threads in on_cpu(args.threads or cores()):
+        what = f"the smallest batch that is sooner than on {threads} threads of the C engine"
+        found[f"crossover_c{threads}_switches"] = what
     found[f"mppi_{args.samples}x{args.plan_steps}_ms"] = "an MPPI update [ms]"
     return found
+
+
+def on_cpu(threads: int) -> list[int]:
+    """Threads of the C engine that engine warp is compared with: 2, and all that there are."""
+    return sorted({min(2, threads), threads})
 
 
 class Bare:
@@ -266,22 +273,22 @@ def _planning(figures: Figures, args: Gpu, device: str) -> None:
     figures.add(f"{name}_efficiency", rate / bare, "physics steps/s of the search over the bare engine's")
     figures.add(f"{name}_candidates_per_s", 1e3 * result.draws / ms, "schedules a second")
     figures.add(f"{name}_ms", ms, f"the best of {size:,} switches, M 3, three policies [ms]")
-    for threads in sorted({min(2, everyone), everyone}):
-        other, _ = took(on("mujoco", threads), size)
-        figures.add(f"{name}_c{threads}_ms", other, "the same on the C engine's threads [ms]")
-    sooner = []
+    times = {size: ms}
     for switches in args.batches:
-        ms, _ = took(on("warp"), switches)
-        figures.add(f"batch_{switches}_ms", ms, f"{switches} of them at once [ms]")
-        for threads in sorted({min(2, everyone), everyone}):
+        times[switches], _ = took(on("warp"), switches)
+        figures.add(f"batch_{switches}_ms", times[switches], f"{switches} of them at once [ms]")
+    for threads in on_cpu(everyone):
+        sooner = []
+        for switches, ms in sorted(times.items()):
             other, _ = took(on("mujoco", threads), switches)
-            figures.add(f"batch_{switches}_c{threads}_ms", other, "the same on the C engine's threads [ms]")
-        if ms < other:
-            sooner.append(switches)
-    if sooner and "crossover_switches" not in figures.missing:
-        figures.add("crossover_switches", sooner[0], "the smallest batch that is sooner than on all threads")
-    elif not sooner:
-        figures.notes["crossover"] = "no batch of switches was sooner than on all threads of the C engine"
+            of = name if switches == size else f"batch_{switches}"
+            figures.add(f"{of}_c{threads}_ms", other, f"the same on {threads} threads of the C engine [ms]")
+            sooner += [switches] if ms < other else []
+        crossover = f"crossover_c{threads}_switches"
+        if not sooner:
+            figures.notes[crossover] = f"no batch was sooner than on {threads} threads of the C engine"
+        elif crossover not in figures.missing:
+            figures.add(crossover, sooner[0], f"the smallest batch that is sooner than on {threads} threads")
     knots = min(cfg.task.jump.sampling.knots, args.plan_steps)
     settings = replace(
         cfg.task.jump.sampling,
