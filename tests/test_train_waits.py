@@ -14,8 +14,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from hmc.go2.conditions import Conditions, NoiseCfg
+from hmc.go2.model import load_model
 from hmc.go2.task import CostCfg, FlipCfg, JumpCfg, flip_task
 from hmc.sim.ids import Ids
+from hmc.sim.warp import WarpSim
 from tests.tiny import CFG, make_env, make_legs, make_runner
 from train import env as env_module
 from train import fallen, legs
@@ -126,6 +128,31 @@ def test_no_step_waits(kind, tmp_path):
             for _ in range(CFG.ppo.steps):
                 step()
     assert not copies.found
+
+
+def test_no_call_of_engine_warp_waits():
+    """But for the graph itself, whose launch never does: rows go in and come out on the device, of worlds by
+    index, as a stretch and all of them, in workspaces of each size."""
+    sim: Any = WarpSim(load_model(), 6, device="cpu", latency=(0, 1, 2, 3, 4, 4))
+    for n in (6, 3, 2):
+        sim.step(sim.u(slice(0, n)), torch.arange(n))
+    for thing in (sim, *sim._spaces.values()):
+        for name, value in vars(thing).items():
+            if isinstance(value, Tensor):
+                setattr(thing, name, value.to(META))
+            elif isinstance(value, dict) and all(isinstance(each, Tensor) for each in value.values()):
+                setattr(thing, name, {key: each.to(META) for key, each in value.items()})
+        thing.run = lambda: None
+    sim._device = META
+    with Copies() as copies:
+        for ids in (None, slice(0, 3), torch.zeros(2, dtype=torch.long, device=META)):
+            x, u = sim.x(ids), sim.u(ids)
+            sim.reset(x, u, ids)
+            sim.step(u, ids)
+            sim.load(sim.save(ids), ids)
+            assert sim.actuator_force(ids).device == META
+    assert not copies.found
+    assert len(sim._spaces) == 3
 
 
 @torch.no_grad()

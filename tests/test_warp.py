@@ -22,6 +22,7 @@ from hmc.go2.model import SUBSTEPS, load_model
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import FlipCfg, JumpCfg, flip_task
 from hmc.go2.variants import Variant
+from hmc.sampling import SamplingCfg
 from hmc.sim import cuda, warp
 from hmc.sim.make import installed, make_sim
 from hmc.sim.warp import WarpSim
@@ -204,10 +205,14 @@ def test_determinism_is_torchs(cuda):
     assert sim._params.opt.deterministic == mjw.DeterminismType.ALL
 
 
-def test_a_flip_is_planned_on_it():
-    """The same search as on the C engine, with policies and an ensemble, at the same cost to rounding."""
-    jump = JumpCfg(guess=((-0.2, -2.0, 3.0, -1.7), (0.2, -1.1, 1.1, -0.8)), mpc=False)
-    cfg = FlipCfg(horizon=3, command=2, jump=jump, ensemble=EnsembleCfg(members=1))
+@pytest.mark.parametrize(("mpc", "members"), [(False, 1), (True, 0)])
+def test_a_flip_is_planned_on_it(mpc, members):
+    """The same search as on the C engine, with policies, an ensemble, or sampling MPC that rolls out in a
+    simulator of its own, at the same cost to rounding."""
+    sampling = SamplingCfg(samples=3, horizon=3, knots=2, replan_every=2, worlds=4)
+    guess = ((-0.2, -2.0, 3.0, -1.7), (0.2, -1.1, 1.1, -0.8))
+    jump = JumpCfg(guess=guess, mpc=mpc, sampling=sampling)
+    cfg = FlipCfg(horizon=3, command=2, jump=jump, ensemble=EnsembleCfg(members=members))
     x = FOOTSTAND.state()
     plans = {}
     engines: list[tuple[Literal["mujoco", "warp"], str]] = [("mujoco", ""), ("warp", "cpu")]

@@ -112,7 +112,7 @@ def listed(args: Gpu) -> dict[str, str]:
     found[f"{search}_candidates_per_s"] = "schedules a second"
     found[f"{search}_efficiency"] = "physics steps/s of the search over the bare engine's"
     for threads in on_cpu(args.threads or cores()):
-        what = f"the smallest batch that is sooner than on {threads} threads of the C engine"
+        what = f"the smallest batch that is sooner than on the C engine, --threads {threads}"
         found[f"crossover_c{threads}_switches"] = what
     found[f"mppi_{args.samples}x{args.plan_steps}_ms"] = "an MPPI update [ms]"
     return found
@@ -282,13 +282,15 @@ def _planning(figures: Figures, args: Gpu, device: str) -> None:
         for switches, ms in sorted(times.items()):
             other, _ = took(on("mujoco", threads), switches)
             of = name if switches == size else f"batch_{switches}"
-            figures.add(f"{of}_c{threads}_ms", other, f"the same on {threads} threads of the C engine [ms]")
+            figures.add(f"{of}_c{threads}_ms", other, f"the same on the C engine, --threads {threads} [ms]")
             sooner += [switches] if ms < other else []
         crossover = f"crossover_c{threads}_switches"
         if not sooner:
-            figures.notes[crossover] = f"no batch was sooner than on {threads} threads of the C engine"
+            figures.notes[crossover] = f"no batch was sooner than on the C engine, --threads {threads}"
         elif crossover not in figures.missing:
-            figures.add(crossover, sooner[0], f"the smallest batch that is sooner than on {threads} threads")
+            figures.add(
+                crossover, sooner[0], f"the smallest batch that is sooner than that, --threads {threads}"
+            )
     knots = min(cfg.task.jump.sampling.knots, args.plan_steps)
     settings = replace(
         cfg.task.jump.sampling,
