@@ -98,6 +98,14 @@ def run(sim: Sim, u: Tensor, ids: Tensor | None = None) -> Tensor:
     return torch.stack(out)
 
 
+def same(found: Tensor, expected: Tensor) -> bool:
+    """Whether what an engine steps to is the same, bit for bit; on a GPU but for the order in which threads
+    finish, which mujoco_warp's option for determinism does not rule out yet."""
+    if found.device.type == "cpu":
+        return torch.equal(found, expected)
+    return bool((found - expected).abs().max() <= TOLERANCE["warp-cuda"] * expected.abs().max().clamp(min=1))
+
+
 def index(sim: Sim, *ids: int) -> Tensor:
     return torch.tensor(ids, dtype=torch.long, device=sim.device)
 
@@ -142,8 +150,8 @@ def test_reset_forgets(sim):
     first = run(sim, u)
     first_rows = sim.save()
     restart(sim)
-    assert torch.equal(run(sim, u), first)
-    assert torch.equal(sim.save(), first_rows)
+    assert same(run(sim, u), first)
+    assert same(sim.save(), first_rows)
 
 
 def test_reset_of_some_worlds(sim):
@@ -163,8 +171,8 @@ def test_load_continues_bit_for_bit(sim):
     first_rows = sim.save()
     sim.load(rows)
     assert torch.equal(sim.save(), rows)
-    assert torch.equal(run(sim, u), first)
-    assert torch.equal(sim.save(), first_rows)
+    assert same(run(sim, u), first)
+    assert same(sim.save(), first_rows)
 
 
 def test_branches_go_the_way_of_their_parent(sim):
@@ -175,11 +183,11 @@ def test_branches_go_the_way_of_their_parent(sim):
 
     order = index(sim, 3, 4, 0, 2, 1)
     sim.load(rows[order])
-    assert torch.equal(run(sim, u[:, order]), whole[:, order])
+    assert same(run(sim, u[:, order]), whole[:, order])
 
     ids, parents = index(sim, 4, 0, 2), index(sim, 1, 1, 3)
     sim.load(rows[parents], ids)
-    assert torch.equal(run(sim, u[:, parents], ids), whole[:, parents])
+    assert same(run(sim, u[:, parents], ids), whole[:, parents])
 
 
 def test_a_step_of_some_leaves_the_others(sim):
@@ -189,9 +197,9 @@ def test_a_step_of_some_leaves_the_others(sim):
     restart(sim)
     before = sim.save()
     ids, others = index(sim, 3, 1), index(sim, 0, 2, 4)
-    assert torch.equal(run(sim, u[:, ids], ids), whole[:, ids])
+    assert same(run(sim, u[:, ids], ids), whole[:, ids])
     assert torch.equal(sim.save(others), before[others])
-    assert torch.equal(run(sim, u[:, others], others), whole[:, others])
+    assert same(run(sim, u[:, others], others), whole[:, others])
 
 
 def test_a_slice_is_its_indices(sim):
@@ -202,7 +210,7 @@ def test_a_slice_is_its_indices(sim):
     whole = run(sim, u)
     restart(sim)
     before = sim.save()
-    assert torch.equal(run(sim, u[:, ids], part), whole[:, ids])
+    assert same(run(sim, u[:, ids], part), whole[:, ids])
     assert torch.equal(sim.save(others), before[others])
     after = sim.save()
     sim.load(before[ids], part)
@@ -219,8 +227,8 @@ def test_a_rollout_is_its_steps(sim):
     states = rollout(sim, u[:, ids].transpose(0, 1), ids)
     reached = sim.save()
     restart(sim)
-    assert torch.equal(states.transpose(0, 1), run(sim, u[:, ids], ids))
-    assert torch.equal(sim.save(), reached)
+    assert same(states.transpose(0, 1), run(sim, u[:, ids], ids))
+    assert same(sim.save(), reached)
 
 
 @pytest.mark.parametrize("latency", [0, 1, 3, 4])
@@ -273,10 +281,10 @@ def test_a_lost_world_stays_alone(sim, bad):
     sim.reset(x, rest(sim))
     after = run(sim, u)
     assert not torch.isfinite(after[-1, lost]).all()
-    assert torch.equal(after[:, others], whole[:, others])
+    assert same(after[:, others], whole[:, others])
 
     sim.reset(start(sim)[lost], rest(sim)[lost], lost)
-    assert torch.equal(run(sim, u[:, lost], lost), whole[:, lost])
+    assert same(run(sim, u[:, lost], lost), whole[:, lost])
 
 
 def test_wrong_arguments(sim):

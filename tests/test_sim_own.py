@@ -10,7 +10,7 @@ from hmc.go2.model import load_model
 from hmc.go2.variants import Variant
 from hmc.sim.base import Sim, rollout
 from hmc.sim.make import make_sim
-from tests.test_sim import TOLERANCE, W, index, inputs, rest, restart, run, start
+from tests.test_sim import TOLERANCE, W, index, inputs, rest, restart, run, same, start
 
 _made: dict[str, Sim] = {}
 LATE = (2, 0, 4, 2, 1)  # physics steps, of each world
@@ -47,7 +47,7 @@ def test_worlds_of_their_own(name):
     states = run(mixed, u)
     restart(mixed)
     ids = index(mixed, 3, 0, 4)
-    assert torch.equal(rollout(mixed, u[:, ids].transpose(0, 1), ids).transpose(0, 1), states[:, ids])
+    assert same(rollout(mixed, u[:, ids].transpose(0, 1), ids).transpose(0, 1), states[:, ids])
     mixed.load(mixed.save(index(mixed, 2)).repeat(W, 1))
     apart = run(mixed, u[:, [2] * W])[-1]
     assert len(torch.unique(apart, dim=0)) == W, "the model and the latency stay with the world"
@@ -63,7 +63,7 @@ def test_worlds_of_their_own(name):
             models=[models[world]],
         )
         alone.reset(start(mixed)[world, None], rest(mixed)[world, None])
-        assert torch.equal(run(alone, u[:, world, None])[:, 0], states[:, world])
+        assert same(run(alone, u[:, world, None])[:, 0], states[:, world])
 
 
 @pytest.mark.parametrize("name", ["warp-cpu", "warp-cuda"])

@@ -37,8 +37,9 @@ class Args:
         device: of engine and networks, such as cpu or cuda:0; auto takes a GPU if there is one.
         threads: of the C engine and of torch; 0 for all cores.
         seed: of everything random.
-        deterministic: the same seed gives the same policy on a GPU, too, somewhat slower; on a CPU with one
-            number of threads it always does.
+        deterministic: on a GPU, let torch and the engine do what they can for the same seed to give the same
+            policy, slower; what the engine lacks for that is in docs/scale.md. On a CPU with one number of
+            threads it always does.
         out: folder for checkpoints and logs; default out/train/MODE or out/train/MODE_STAGE.
         resume: go on from the latest checkpoint in `out`, or from the file given by --checkpoint.
         checkpoint: a file to begin from (weights, optimiser, curriculum).

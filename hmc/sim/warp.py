@@ -72,8 +72,8 @@ class WarpSim:
     it had diverged, and `overflow` counts it. The default sizes hold every contact that the geoms of the
     model can make at once, so that this happens only to sizes set by hand.
 
-    Results on a GPU depend on the order in which threads finish, unless `deterministic`; on Warp's CPU
-    device they are exact. That device is for parity tests: 4 to 5 times slower than one thread of the
+    The last bits of results on a GPU depend on the order in which threads finish; on Warp's CPU device they
+    are the same in every run. That device is for parity tests: 4 to 5 times slower than one thread of the
     C engine, at any number of worlds.
 
     Attributes:
@@ -87,8 +87,9 @@ class WarpSim:
         substeps: physics steps a control step.
         contacts: None for all that the geoms can make at once.
         constraints: None for what so many contacts and all limits come to.
-        deterministic: same bits in every run on a GPU, somewhat slower; None for what torch is set to
-            (`torch.use_deterministic_algorithms`).
+        deterministic: all that mujoco_warp has against that, slower; None for what torch is set to
+            (`torch.use_deterministic_algorithms`). Version 4.0 sums up in a fixed order then, but does not
+            sort contacts and constraint rows yet, so that a GPU's bits may differ still.
         latency: physics steps of a control step in which the input before it still acts; one of all worlds
             or one of each.
         models: a model of each world, which may differ from `model` in what `hmc.sim.variety.OWN` names;
