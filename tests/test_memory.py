@@ -17,6 +17,7 @@ from hmc.go2.policy import Policy
 from hmc.go2.task import CostCfg, policy_path, stance_cost, timeline
 from hmc.memory import SHARE, WORKING, make_worlds, needs
 from hmc.sim.cuda import num_bytes
+from hmc.sim.device import free_memory
 from hmc.sim.warp import WarpSim
 from tests.toy import ToySim, toy_task
 
@@ -53,6 +54,24 @@ def test_what_a_device_has_free_decides(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda device: (FIXED + 40.5 * EACH) / SHARE)
     assert make_worlds(toy_task(HORIZON), 5000).num_worlds == 40
     assert make_worlds(toy_task(HORIZON), 5000, FIXED + 7 * EACH).num_worlds == 7, "a setting goes first"
+
+
+def test_what_was_given_up_is_free(monkeypatch):
+    done: list[str] = []
+
+    def told(name: str, result: Any = None) -> None:
+        def call(*_: Any) -> Any:
+            done.append(name)
+            return result
+
+        monkeypatch.setattr(torch.cuda, name, call)
+
+    told("synchronize")
+    told("empty_cache")
+    told("mem_get_info", (3, 8))
+    assert free_memory(torch.device("cuda", 0)) == 3
+    assert done == ["synchronize", "empty_cache", "mem_get_info"]
+    assert free_memory(torch.device("cpu")) == float("inf")
 
 
 def test_not_even_one(monkeypatch):

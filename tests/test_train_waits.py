@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import pytest
 import torch
 from rsl_rl.utils.logger import Logger
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -34,12 +35,43 @@ META = torch.device("meta")
 KINDS = ("stance", "walk", "getup", "unified")
 
 
+class Given(TorchFunctionMode):
+    """Notes what makes a tensor elsewhere of Python's numbers, and what picks by a list of them: a copy, too,
+    but of a tensor that never shows."""
+
+    MAKERS = (torch.tensor, torch.as_tensor, Tensor.new_tensor)
+    PICKERS = (Tensor.__getitem__, Tensor.__setitem__)
+
+    def __init__(self, found: list[str]) -> None:
+        super().__init__()
+        self.found = found
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        picked = args[1] if func in self.PICKERS and isinstance(args[1], tuple) else args[1:2]
+        given = func in self.PICKERS and any(isinstance(each, list) for each in picked)
+        where = args[0] if given else out if func in self.MAKERS else None
+        if where is not None and where.device.type != "cpu":
+            self.found.append(func.__name__)
+        return out
+
+
 class Copies(TorchDispatchMode):
     """Notes what takes a tensor of the CPU to one elsewhere: torch waits in each of them."""
 
     def __init__(self) -> None:
         super().__init__()
         self.found: list[str] = []
+        self._given = Given(self.found)
+
+    def __enter__(self) -> Self:
+        self._given.__enter__()
+        super().__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        self._given.__exit__(*error)
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
@@ -47,8 +79,9 @@ class Copies(TorchDispatchMode):
             [each for each in tree_leaves(part) if isinstance(each, Tensor)]
             for part in ((args, kwargs or {}), out)
         )
-        # numbers () are handed to a kernel by value
-        here = any(each.device.type == "cpu" and each.ndim > 0 for each in given)
+        # numbers () are handed to a kernel by value, but where they are copied as such
+        copied = func.overloadpacket.__name__ in ("_to_copy", "copy_")
+        here = any(each.device.type == "cpu" and (each.ndim > 0 or copied) for each in given)
         if here and any(each.device.type != "cpu" for each in (*given, *made)):
             self.found.append(str(func))
         return out

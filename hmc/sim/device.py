@@ -37,8 +37,15 @@ def devices() -> str:
 
 
 def free_memory(device: torch.device) -> float:
-    """Bytes that are free on a device; without end on a CPU, which says for itself when it has no more."""
-    return float("inf") if device.type == "cpu" else float(torch.cuda.mem_get_info(device)[0])
+    """Bytes that are free on a device; without end on a CPU, which says for itself when it has no more.
+
+    What torch and Warp keep of what was given up counts as free; on a GPU that is waited for.
+    """
+    if device.type == "cpu":
+        return float("inf")
+    torch.cuda.synchronize(device)  # Warp gives back then
+    torch.cuda.empty_cache()
+    return float(torch.cuda.mem_get_info(device)[0])
 
 
 def used_up(error: RuntimeError) -> bool:

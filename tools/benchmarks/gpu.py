@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -22,7 +23,7 @@ from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, jump_mode, policy_path
 from hmc.memory import make_worlds
 from hmc.sim.cuda import capture, graphs, num_bytes
-from hmc.sim.device import devices
+from hmc.sim.device import devices, find_device, free_memory
 from hmc.sim.make import make_sim
 from hmc.sim.warp import WarpSim
 from tools import closed_loop
@@ -182,12 +183,13 @@ def seconds(work: Callable[[], Any], device: str, repeats: int) -> float:
 
 def _stepping(figures: Figures, args: Gpu, device: str, worlds: int) -> None:
     """Given targets through the simulator, zero actions through the environment, against mjw.step alone."""
-    free = torch.cuda.mem_get_info()[0] if device != "cpu" else 0
-    sim = WarpSim(load_model(), worlds, device=device)
+    gc.collect()  # a runner and its table hold each other, and the worlds of the training before
+    there = find_device(device)
+    free = free_memory(there)
+    sim = WarpSim(load_model(), worlds, device=there)
     if device != "cpu":
         sim.step(sim.u())
-        finish(device)
-        used = free - torch.cuda.mem_get_info()[0]
+        used = free - free_memory(there)
         figures.add(f"memory_{worlds}_kb", used / worlds / 1024, "device memory a world, all included [KiB]")
     alone = Bare(sim)
     x = torch.zeros(worlds, 37, device=device)
