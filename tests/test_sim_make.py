@@ -144,6 +144,20 @@ def test_too_little_room_is_never_silent(model):
         tell_overflow(sim)
 
 
+def test_too_few_contacts_are_everybodys(model):
+    """They are pooled, and whose are missing is not known: but only of those that stepped together."""
+    from hmc.sim.warp import WarpSim
+
+    sim = WarpSim(model, 4, device="cpu", substeps=1, contacts=1)
+    x, u = standing(4), HOME.repeat(4, 1)
+    x[1, 2] = 0.25  # all feet in the ground, which is more than three contacts
+    sim.reset(x, u)
+    sim.step(u[1:], torch.tensor([3, 1, 2]))
+    assert torch.isfinite(sim.x()).all(1).tolist() == [True, False, False, False]
+    with pytest.warns(UserWarning, match=r"3 by contacts; give the simulator more contacts="):
+        tell_overflow(sim)
+
+
 def test_default_room_is_enough(model):
     """Even folded up and sunk into the floor, which is as many contacts as the geoms can make."""
     from hmc.sim.warp import WarpSim

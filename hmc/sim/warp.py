@@ -41,10 +41,11 @@ PAIR_CONTACTS = {
 }
 MAX_CONTACTS = 128  # a world; more than that is sized by hand
 
-# Overflows that drop contacts or constraints; a solver at its iteration limit drops nothing.
+# Overflows that drop contacts or constraints; a solver at its iteration limit drops nothing, nor do sensors.
+_FLAGS = mjw.OverflowType
 LOSSES = {
-    "constraints": mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ,
-    "contacts": mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD,
+    "constraints": _FLAGS.NEFC | _FLAGS.NJMAX_NNZ | _FLAGS.NVMAX,
+    "contacts": _FLAGS.BROADPHASE | _FLAGS.NARROWPHASE | _FLAGS.CCD | _FLAGS.HFIELD | _FLAGS.EPA_HORIZON,
 }
 
 
@@ -69,8 +70,10 @@ class WarpSim:
     Nothing in step, save, load, reset, x, u waits for the device.
 
     A world whose contacts or constraints do not fit is no longer physics: its state becomes NaN, as if
-    it had diverged, and `overflow` counts it. The default sizes hold every contact that the geoms of the
-    model can make at once, so that this happens only to sizes set by hand.
+    it had diverged, and `overflow` counts it. Contacts are pooled: where they do not fit, some are missing
+    in nobody knows which of the worlds that step together, and all of these are lost. The default sizes hold
+    every contact that the geoms of the model can make at once, so that this happens only to sizes set by
+    hand.
 
     The last bits of results on a GPU depend on the order in which threads finish; on Warp's CPU device they
     are the same in every run. That device is for parity tests: 4 to 5 times slower than one thread of the
