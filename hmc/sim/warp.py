@@ -67,7 +67,8 @@ class WarpSim:
     smallest workspace that holds n, one of W, W/2, W/4, ... worlds (made at first use), so that it costs
     at most twice the step of n worlds, and all workspaces together at most twice the memory.
 
-    Nothing in step, save, load, reset, x, u waits for the device.
+    Nothing in step, save, load, reset, x, u waits for the device, but the first step in a workspace, which
+    is recorded.
 
     A world whose contacts or constraints do not fit is no longer physics: its state becomes NaN, as if
     it had diverged, and `overflow` counts it. Contacts are pooled: where they do not fit, some are missing
