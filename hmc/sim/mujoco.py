@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.sim.check import check, check_latency
-from hmc.sim.ids import Ids, fresh, where
+from hmc.sim.ids import Ids, where
 
 _STATE = int(mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL)
 
@@ -61,14 +62,15 @@ class MujocoSim:
         self.batch = Batch(model, num_worlds, threads)
         if models is not None:
             self.batch.set_models(list(models))
-        self._substeps, self._late = substeps, torch.tensor(late)
+        self._substeps, self._late = substeps, np.array(late)
         # a control step's stretches: after so many physics steps, the inputs that arrive then begin to act
         self._arrivals = sorted({0, *late})
-        self._row = torch.from_numpy(self.batch.state)
+        # read and written in numpy: for few worlds a torch operation takes several times as long
+        self._row = self.batch.state
         self._x = self._row[:, 1 : 1 + self.nx]  # a row begins with time, qpos, qvel
-        self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
+        self._ctrl = self.batch.bind("ctrl")
         self._force = self.batch.bind("actuator_force")  # filled by steps after the bind, so bind now
-        self._fresh = self._row[0].clone()
+        self._fresh = self._row[0].copy()
         self._each = np.arange(num_worlds, dtype=np.int32)
 
     @property
@@ -96,66 +98,75 @@ class MujocoSim:
         return torch.float64
 
     def x(self, ids: Ids = None) -> Tensor:
-        return fresh(self._x, ids)
+        return _copied(self._x, ids)
 
     def u(self, ids: Ids = None) -> Tensor:
-        return fresh(self._ctrl, ids)
+        return _copied(self._ctrl, ids)
 
     def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
-        ids = where(ids)
-        self._row[ids] = self._fresh
-        self._x[ids] = x.to(torch.float64)
-        self._ctrl[ids] = u.to(torch.float64)
+        at = _where(ids)
+        self._row[at], self._x[at], self._ctrl[at] = self._fresh, x.numpy(), u.numpy()
 
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
+        at, given = _where(ids), u.numpy()
         # the engine takes indices in ascending order only
-        order = None if ids is None else self._each[ids] if isinstance(ids, slice) else np.sort(ids.numpy())
+        order = None if ids is None else self._each[at] if isinstance(at, slice) else np.sort(at)
         if len(self._arrivals) == 1:
-            self._ctrl[where(ids)] = u.to(torch.float64)
+            self._ctrl[at] = given
             self.batch.step(order, nstep=self._substeps)
             return
-        late, u, before = self._late[where(ids), None], u.to(torch.float64), self.u(ids)
+        late, before = self._late[at, None], self._ctrl[at].copy()
         for begin, end in pairwise([*self._arrivals, self._substeps]):
-            self._ctrl[where(ids)] = u.where(late <= begin, before)
+            self._ctrl[at] = np.where(late <= begin, given, before)
             if end > begin:
                 self.batch.step(order, nstep=end - begin)
 
     def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
         """States after each control step under given inputs, as `hmc.sim.base.rollout`, in one call."""
         check(self.num_worlds, ids, controls=(controls[:, 0], self.nu))
-        order = ids.argsort()  # the engine takes indices in ascending order only
-        held = controls[order].repeat_interleave(self._substeps, 1).to(torch.float64)
-        steps, late = held.shape[1], self._late[ids[order]]
+        at, given = ids.numpy(), controls.numpy()
+        order = at.argsort()  # the engine takes indices in ascending order only
+        at, held = at[order], given[order].repeat(self._substeps, 1).astype(np.float64, copy=False)
         if len(self._arrivals) > 1:
             # what each physics step sees: the input from before it, `late` physics steps ago
-            held = torch.cat([self._ctrl[ids[order]][:, None], held], 1)
-            seen = (1 + torch.arange(steps) - late[:, None]).clamp(min=0)
-            held = held[torch.arange(len(held))[:, None], seen]
-        at = ids[order].numpy()
+            held = np.concatenate([self._ctrl[at][:, None], held], 1)
+            seen = (np.arange(1, held.shape[1]) - self._late[at, None]).clip(min=0)
+            held = held[np.arange(len(at))[:, None], seen]
         warned = self.batch.warning[at]
-        found = self.batch.rollout(steps, held.numpy(), record=(_STATE,), ids=at)
-        x = torch.from_numpy(found[_STATE])
+        states = self.batch.rollout(held.shape[1], held, record=(_STATE,), ids=at)[_STATE]
         # a world that the engine warned of and gave up repeats its last state, although it moves there
         for row in np.flatnonzero((self.batch.warning[at] != warned).any((1, 2))):
-            states = x[row]
-            stuck = (states[1:] == states[:-1]).all(1) & (states[1:, self.model.nq :] != 0).any(1)
-            states[1:][stuck] = torch.nan
+            now, then = states[row, 1:], states[row, :-1]
+            now[(now == then).all(1) & (now[:, self.model.nq :] != 0).any(1)] = np.nan
         if len(self._arrivals) > 1:
-            self._ctrl[ids] = controls[:, -1].to(torch.float64)
-        return x[order.argsort(), self._substeps - 1 :: self._substeps]
+            self._ctrl[ids] = given[:, -1]
+        found = np.empty((len(at), given.shape[1], self.nx))
+        found[order] = states[:, self._substeps - 1 :: self._substeps]
+        return torch.from_numpy(found)
 
     def save(self, ids: Ids = None) -> Tensor:
-        return fresh(self._row, ids)
+        return _copied(self._row, ids)
 
     def load(self, rows: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, rows=(rows, self._row.shape[1]))
-        self._row[where(ids)] = rows
+        self._row[_where(ids)] = rows.numpy()
 
     def actuator_force(self, ids: Ids = None) -> Tensor:
         """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
         return torch.tensor(self._force)[where(ids)]
+
+
+def _where(ids: Ids) -> NDArray[np.int64] | slice:
+    """What indexes an array of numpy's with a row a world."""
+    return ids.numpy() if isinstance(ids, Tensor) else slice(None) if ids is None else ids
+
+
+def _copied(buffer: NDArray[np.float64], ids: Ids) -> Tensor:
+    """A copy of what `buffer` holds for worlds `ids`."""
+    rows = buffer[_where(ids)]
+    return torch.from_numpy(rows if isinstance(ids, Tensor) else rows.copy())
 
 
 def _quiet(message: str) -> None:
