@@ -61,14 +61,16 @@ class Policy(Mode):
         return torch.from_numpy(network.anchor_of(x.numpy()))
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-        told = () if self.command is None else (self.command(x, k),)
+        told = None if self.command is None else self.command(x, k)
         if x.device.type != "cpu":
             memory = follow(x, memory)
-            return self.on_device(x, u, memory, *told), memory
+            return self.on_device(x, u, memory, told), memory
         # in numpy: for few worlds a torch operation takes several times as long
-        memory = torch.from_numpy(network.follow(x.numpy(), memory.numpy()))
-        target = self.network.act(*(each.numpy() for each in (x, u, memory, *told)))
-        return torch.from_numpy(target).to(x), memory
+        state, before = x.numpy(), memory.numpy()
+        anchor = network.follow(state, before)
+        target = self.network.act(state, u.numpy(), anchor, None if told is None else told.numpy())
+        action = torch.from_numpy(target).to(x.dtype)
+        return action, memory if anchor is before else torch.from_numpy(anchor)
 
     def on_device(self, x: Tensor, u: Tensor, anchor: Tensor, command: Tensor | None = None) -> Tensor:
         """Joint targets [rad], (n, 12), as of `Network.act`, without leaving the device of x (n, 37)."""
