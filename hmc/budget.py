@@ -74,8 +74,10 @@ class Meter:
         """
         if self.budget.control_steps is None:
             return len(schedules)
-        needed = self.evaluator.needs(schedules) * self._nested
-        return int(np.searchsorted(needed, self.budget.control_steps - self.evaluator.control_steps, "right"))
+        left, each = self.budget.control_steps - self.evaluator.control_steps, self._nested
+        if self.evaluator.most(len(schedules)) * each <= left:
+            return len(schedules)
+        return int(np.searchsorted(self.evaluator.needs(schedules) * each, left, "right"))
 
     def settle(self) -> None:
         """Record the schedule followed last if there is room for that: a next search goes on from it.

@@ -158,6 +158,11 @@ class Evaluator:
             steps = np.minimum(steps, alone.cumsum())
         return len(self._trunk) * np.concatenate([[0], steps])[len(ahead) + new.cumsum()]
 
+    def most(self, number: int) -> int:
+        """What `needs` says of so many schedules at most, without a look at them."""
+        # each is rolled out whole, after what is recorded beside them, and each begins a part
+        return len(self._trunk) * self.task.horizon * 2 * (number + 1)
+
     @torch.no_grad()
     def follow(self, schedule: Schedule) -> float:
         """Cost of a schedule, so that others are rolled out from where they part from it.

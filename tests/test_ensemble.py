@@ -241,6 +241,7 @@ def test_what_a_batch_needs_is_known_before(rows, known, after, num_worlds):
     ours.follow(Schedule(tuple(after)))
     before, needs = ours.control_steps, ours.needs(rows)
     assert (np.diff(needs) >= 0).all()
+    assert needs[-1] <= ours.most(len(rows))
     ours.costs(rows)
     taken = ours.control_steps - before
     assert taken == needs[-1] if num_worlds == 64 and taken > 0 else taken <= needs[-1]

@@ -271,6 +271,7 @@ def test_what_a_batch_needs_is_known_before(rows, known, after, num_worlds):
     before, needs = rolled.control_steps, rolled.needs(rows)
     assert len(needs) == len(rows)
     assert (np.diff(needs) >= 0).all()
+    assert needs[-1] <= rolled.most(len(rows))
     first = len(rows) // 2
     rolled.costs(rows[:first])
     taken = rolled.control_steps - before
