@@ -25,11 +25,14 @@ class Cost:
         terminal: name -> f(x, k) -> (n,).
         nonnegative: whether every term is >= 0 everywhere, which lets the planner stop a rollout as
             soon as its partial cost exceeds the best one known.
+        on_cpu: the stage terms in order of `stage`, (n, number of stage terms), in one call: the same numbers
+            to the bit in less time, from float64 on the CPU; None: they are asked for one after the other.
     """
 
     stage: Mapping[str, StageFn]
     terminal: Mapping[str, TerminalFn] = field(default_factory=dict)
     nonnegative: bool = False
+    on_cpu: StageFn | None = None
 
     def __post_init__(self) -> None:
         if not self.stage and not self.terminal:
@@ -42,6 +45,8 @@ class Cost:
         """Stage terms in order of `stage`, (n, number of stage terms)."""
         if not self.stage:
             return x.new_zeros(len(x), 0)
+        if self.on_cpu is not None and x.device.type == "cpu" and x.dtype == torch.float64:
+            return self.on_cpu(x, u, u_prev, k)
         return torch.stack([f(x, u, u_prev, k) for f in self.stage.values()]).T
 
     def terminal_terms(self, x: Tensor, k: Tensor) -> Tensor:

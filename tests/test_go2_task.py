@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,20 @@ def test_no_term_is_ever_negative():
     k = torch.randint(0, 2 * COMMAND, (n,))
     assert (COST.stage_terms(x, u, u_prev, k) >= 0).all()
     assert (COST.terminal_terms(x, k) >= 0).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 77, 300])
+@pytest.mark.parametrize("spread", [0.05, 5.0])
+def test_terms_at_once_are_those_one_by_one(n, spread):
+    """To the bit: what a rollout decides hangs on it."""
+    x = HANDSTAND.state() + spread * torch.randn(n, 37).double()
+    u = x[:, 7:19] + spread * torch.randn(n, 12).double()
+    u_prev = u + spread * torch.randn(n, 12).double()
+    u[0, 3] = math.nan
+    given = x, u, u_prev, torch.randint(0, 2 * COMMAND, (n,))
+    plain = replace(COST, on_cpu=None).stage_terms(*given)
+    torch.testing.assert_close(COST.stage_terms(*given), plain, rtol=0, atol=0, equal_nan=True)
+    assert plain[0].isnan().any() and (n == 1 or plain[1:].isfinite().all())
 
 
 def test_tail():

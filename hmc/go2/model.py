@@ -65,7 +65,7 @@ def motor_torque(q: Tensor, qd: Tensor, target: Tensor) -> Tensor:
     never exceeds 20.2 N m in either direction; both axes scaled by GEAR for the calf. The engine
     computes the same law as a DC motor whose voltage saturates.
     """
-    stall, peak, negative, slope = _motor(q.dtype, q.device)
+    stall, peak, negative, slope = motor_curve(q.dtype, q.device)
     torque, back = KP * (target - q) - KD * qd, slope * qd
     top = (stall - back).clamp(negative, peak)
     bottom = (-stall - back).clamp(negative, peak)
@@ -73,7 +73,7 @@ def motor_torque(q: Tensor, qd: Tensor, target: Tensor) -> Tensor:
 
 
 @cache
-def _motor(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+def motor_curve(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
     """Stall torque, peak torque and its negative, slope of the driving line, of each joint, (12,)."""
     with torch.inference_mode(False):
         gear = GEAR.to(device, dtype, copy=True)

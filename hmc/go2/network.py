@@ -38,7 +38,7 @@ def observe(x: Array, u: Array, anchor: Array) -> Array:
         u: previous action: joint targets [rad], (n, 12).
         anchor: where the mode was entered, (n, 4): x, y [m], cos and sin of the heading.
     """
-    turn = _rotation(x, slice(None)).reshape(3, 3, -1)
+    turn = rotation(x, slice(None)).reshape(3, 3, -1)
     across = turn * x.T[19:22, None]
     (px, py), (ax, ay, c, s) = x.T[:2], anchor.T
     dx, dy = px - ax, py - ay
@@ -58,7 +58,7 @@ def observe(x: Array, u: Array, anchor: Array) -> Array:
 
 def anchor_of(x: Array) -> Array:
     """Anchor at states x (n, 37), (n, 4): that of `hmc.go2.observe.anchor_of`, by the same operations."""
-    left = _rotation(x, _LEFT)
+    left = rotation(x, _LEFT)
     across, ahead = left / np.maximum(np.sqrt(left[0] * left[0] + left[1] * left[1]), 1e-6)
     return np.stack([x[:, 0], x[:, 1], ahead, -across], 1, dtype=x.dtype)
 
@@ -75,7 +75,7 @@ def follow(x: Array, anchor: Array) -> Array:
     return np.concatenate([np.where(far[:, None], at, anchor[:, :2]), anchor[:, 2:]], 1)
 
 
-def _rotation(x: Array, which: slice) -> Array:
+def rotation(x: Array, which: slice) -> Array:
     """Some of the 9 entries, row by row, of the rotations body to world at states x (n, 37), (entries, n)."""
     factors = x.T[3:7].take(_PAIRS[..., which], 0)
     product, (sign, factor, constant) = factors[0] * factors[1], _LAW[:, which]

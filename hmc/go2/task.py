@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hmc.cost import Cost, StageFn
 from hmc.go2 import model as go2
 from hmc.go2.ensemble import EnsembleCfg, make_ensemble
+from hmc.go2.network import rotation
 from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND, STAND
 from hmc.go2.value import Value
@@ -165,7 +167,41 @@ def stance_cost(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> Cost:
         "energy": energy,
         "pose": pose,
     }
-    return Cost(stage, {"tail": tail}, nonnegative=True)
+    return Cost(stage, {"tail": tail}, nonnegative=True, on_cpu=_in_numpy(cfg, target))
+
+
+def _in_numpy(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> StageFn:
+    """The stage terms of `stance_cost` by the same operations: for few states a torch operation takes several
+    times as long as one of numpy's. What adds numbers up is torch's, in its order."""
+    weights = np.array([cfg.height, cfg.orientation, cfg.joints, cfg.rate, cfg.energy, cfg.pose])[:, None]
+    cpu = torch.float64, torch.device("cpu")
+    heights, gravity, poses = (each.numpy() for each in _targets(*cpu))
+    stall, peak, negative, slope = (each.numpy() for each in go2.motor_curve(*cpu))
+
+    def terms(x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
+        state, inputs, at = x.numpy(), u.numpy(), target(k).long().numpy()
+        q, qd = state[:, 7:19], state[:, 25:37]
+        away = np.empty((3, len(state), 12))
+        np.subtract(q, poses[at], out=away[0])
+        np.subtract(inputs, u_prev.numpy(), out=away[1])
+        np.subtract(q, poses[STAND_TARGET], out=away[2])
+        away *= away
+        squares = torch.from_numpy(away).sum(2)
+        ahead, sideways = rotation(state, slice(6, 8))
+        ahead += gravity[at]
+        below = heights[at] - state[:, 2]
+        torque, back = go2.KP * (inputs - q) - go2.KD * qd, slope * qd
+        top = np.minimum(np.maximum(stall - back, negative), peak)
+        bottom = np.minimum(np.maximum(-stall - back, negative), peak)
+        power = torch.from_numpy(qd * np.minimum(np.maximum(torque, bottom), top))
+        found = np.empty((6, len(state)))
+        found[0], found[1] = below * below, ahead * ahead + sideways * sideways
+        found[2:4] = squares[:2]
+        found[4], found[5] = torch.linalg.vector_norm(power, dim=1), torch.exp(-squares[2])
+        found *= weights
+        return torch.from_numpy(found).T
+
+    return terms
 
 
 def with_values(cost: Cost, weight: float, hand: Callable[[Tensor], Tensor], threads: int = 1) -> Cost:
@@ -182,7 +218,7 @@ def with_values(cost: Cost, weight: float, hand: Callable[[Tensor], Tensor], thr
                 lack[rows] = (1.0 - worth(x[rows])).clamp(min=0.0)
         return weight * lack
 
-    return Cost(cost.stage, {**cost.terminal, "value": value}, nonnegative=cost.nonnegative)
+    return replace(cost, terminal={**cost.terminal, "value": value})
 
 
 def _idle_mode(name: str, threads: int) -> Mode:
