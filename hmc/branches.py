@@ -181,6 +181,8 @@ def in_order(schedules: Tensor, trunk: Sequence[int]) -> np.ndarray:
 def _order(steps: np.ndarray, trunk: Sequence[int]) -> np.ndarray:
     """As `in_order`, of steps (T, n)."""
     horizon, n = steps.shape
+    if n < 2:
+        return np.arange(n)
     # the trunk's mode becomes the first of each step's alphabet, so that the trunk sorts before all others
     swapped, lead = steps + 1, np.asarray(trunk, dtype=steps.dtype)[:, None]
     known = swapped[: len(trunk)]

@@ -207,16 +207,21 @@ class Recorder:
             barred: whether a guard barred its next mode.
         """
         known, agree = self.known, next(i for i, branch in enumerate(path) if branch >= 0)
-        stage, rows = [], []
+        stage: list[Floats] = []
+        rows: list[list[Tensor]] = []
         for i in range(agree, len(modes)):
             if i not in self._stage or i + 1 not in self._rows:
                 break
             (ids, found), (then, situation) = self._stage[i], self._rows[i + 1]
             place, after = self._place(ids, path[i]), self._place(then, path[i + 1])
-            if place is None or after is None or not math.isfinite(found[:, place].sum()):
+            if place is None or after is None:
                 break
             stage.append(found[:, place].T)
-            rows.append([part[after] for part in situation])
+            alone = len(situation[0]) == len(known)  # to take all of them would be a copy for nothing
+            rows.append(list(situation) if alone else [part[after] for part in situation])
+        found_stages = np.array(stage)
+        good = np.isfinite(found_stages.sum((1, 2))) if rows else np.ones(0, dtype=bool)
+        rows = rows if good.all() else rows[: int(good.argmin())]
         # steps first, then members
         stages = torch.stack([each.stage[:agree] for each in known], 1)
         measured = [name for name in SITUATION if name != "mode"]
@@ -224,7 +229,7 @@ class Recorder:
             name: torch.stack([getattr(each, name)[: agree + 1] for each in known], 1) for name in measured
         }
         if rows:
-            stages = torch.cat([stages, torch.from_numpy(np.stack(stage))])
+            stages = torch.cat([stages, torch.from_numpy(found_stages[: len(rows)])])
             for name, column in zip(measured, zip(*rows, strict=True), strict=True):
                 parts[name] = torch.cat([parts[name], torch.stack(column)])
         mode = torch.tensor([int(known[0].mode[0]), *modes[: len(stages)]])
