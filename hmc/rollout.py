@@ -211,11 +211,6 @@ class _Rollout:
         )
 
     @property
-    def _at(self) -> Ids:
-        """The worlds of `at`; None, which costs least, where they are all."""
-        return None if self.size * self.members == self.sim.num_worlds else self.at
-
-    @property
     def _indices(self) -> np.ndarray:
         return np.arange(self.ids.stop) if isinstance(self.ids, slice) else self.ids
 
@@ -233,6 +228,8 @@ class _Rollout:
         self.size = ids.stop if isinstance(ids, slice) else len(ids)
         places = slice(0, self.size) if self.cheap or isinstance(ids, slice) else self._device(ids)
         self.at = blocks(places, self.members)
+        # the same for the simulator; None, which costs least, where they are all
+        self._at: Ids = None if self.size * self.members == self.sim.num_worlds else self.at
 
     def _blocks(self, branches: Indices) -> Indices:
         """The worlds of branches (n,) that lie side by side, (n E,)."""
