@@ -133,7 +133,7 @@ class Worlds:
         ks = torch.full((n,), k, device=x.device)
         if part.entered is not None:
             self._enter(part, x, u, ks)
-        memory = self.memory[:, :size]
+        memory = self.memory if size == self.memory.shape[1] else self.memory[:, :size]
         memory = memory[part.at] if isinstance(part.at, slice) else memory.index_select(0, part.at)
         nested = mode.control_steps
         action, after = mode.act(x, u, memory, ks)
@@ -149,11 +149,13 @@ class Worlds:
             return
         assert new is not None
         at, size = self._all[part.at].index_select(0, new), part.mode.memory_size
-        self.memory[:, size:].index_fill_(0, at, 0.0)
+        if size < self.memory.shape[1]:
+            self.memory[:, size:].index_fill_(0, at, 0.0)
         if size > 0:
-            start = part.mode.reset(x.index_select(0, new), u.index_select(0, new), k[: len(at)])
-            start = _shaped(part.mode, "reset() memory", start, (len(at), size)).to(self.memory.dtype)
-            self.memory[:, :size].index_copy_(0, at, start)
+            if len(at) < len(x):
+                x, u, k = x.index_select(0, new), u.index_select(0, new), k[: len(at)]
+            start = _shaped(part.mode, "reset() memory", part.mode.reset(x, u, k), (len(at), size))
+            self.memory[:, :size].index_copy_(0, at, start.to(self.memory.dtype))
 
 
 @dataclass

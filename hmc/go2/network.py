@@ -60,7 +60,10 @@ def anchor_of(x: Array) -> Array:
     """Anchor at states x (n, 37), (n, 4): that of `hmc.go2.observe.anchor_of`, by the same operations."""
     left = rotation(x, _LEFT)
     across, ahead = left / np.maximum(np.sqrt(left[0] * left[0] + left[1] * left[1]), 1e-6)
-    return np.stack([x[:, 0], x[:, 1], ahead, -across], 1, dtype=x.dtype)
+    out = np.empty((len(x), 4), x.dtype)
+    out[:, :2], out[:, 2] = x[:, :2], ahead
+    np.negative(across, out=out[:, 3])
+    return out
 
 
 def follow(x: Array, anchor: Array) -> Array:
