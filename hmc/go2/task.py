@@ -214,6 +214,8 @@ def with_values(cost: Cost, weight: float, hand: Callable[[Tensor], Tensor], thr
             return weight * (1.0 - torch.where(target, other(x), foot(x))).clamp(min=0.0)
         lack = torch.zeros(len(x), dtype=x.dtype, device=x.device)
         for worth, rows in ((foot, (~target).nonzero()[:, 0]), (other, target.nonzero()[:, 0])):
+            if len(rows) == len(x):
+                return weight * (1.0 - worth(x)).clamp(min=0.0)
             if len(rows):
                 lack[rows] = (1.0 - worth(x[rows])).clamp(min=0.0)
         return weight * lack

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from hmc.go2 import network
 from hmc.go2.model import motor_torque
 from hmc.go2.network import opened
 from hmc.go2.observe import anchor_of, observe
@@ -61,12 +62,19 @@ class Value:
 
     def __call__(self, x: Tensor) -> Tensor:
         """Values of states x (n, 37), (n,)."""
-        q = x[:, 7:19]
-        obs = seen(observe(x, q, anchor_of(x)), motor_torque(q, x[:, 25:37], q), x[:, 2]).float()
-        if x.device.type != "cpu":
-            return self.on_device(obs)[:, 0].to(x) / self.rest
-        (output,) = self._session.run(None, {"obs": obs.numpy()})
-        return torch.from_numpy(output[:, 0]).to(x) / self.rest
+        q, on_cpu = x[:, 7:19], x.device.type == "cpu"
+        if on_cpu:  # in numpy: for few states a torch operation takes several times as long
+            state = x.numpy()
+            obs = torch.from_numpy(network.observe(state, q.numpy(), network.anchor_of(state)))
+        else:
+            obs = observe(x, q, anchor_of(x))
+        obs = seen(obs, motor_torque(q, x[:, 25:37], q), x[:, 2]).float()
+        output = (
+            torch.from_numpy(self._session.run(None, {"obs": obs.numpy()})[0])
+            if on_cpu
+            else self.on_device(obs)
+        )
+        return output[:, 0].to(x) / self.rest
 
     def on_device(self, obs: Tensor) -> Tensor:
         """The critic's output (n, 1) for what it sees (n, c + 13) float32, without leaving its device."""
