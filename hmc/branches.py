@@ -113,7 +113,7 @@ def _parted(steps: np.ndarray, trunk: Sequence[int]) -> tuple[np.ndarray, np.nda
     birth = np.where(apart.any(0), apart.argmax(0), horizon)
     # the parent of a branch is the last one before it that was there earlier: its neighbour's ancestor
     parent = np.full(n, -1)
-    for i in np.unique(birth)[1:]:
+    for i in np.flatnonzero(np.bincount(birth))[1:]:
         here, there = np.flatnonzero(birth == i), np.flatnonzero(birth < i)
         last = np.searchsorted(there, here) - 1
         parent[here] = np.where(last < 0, -1, order[there[last]])

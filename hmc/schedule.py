@@ -48,14 +48,14 @@ class Schedule(Sequence[int]):
 
     def __post_init__(self) -> None:
         items: Iterable[int] = self.modes.tolist() if isinstance(self.modes, Tensor) else self.modes
-        modes = tuple(operator.index(mode) for mode in items)
+        modes = tuple(map(operator.index, items))
         if not modes:
             raise ValueError("a schedule needs at least one control step, got none")
         limit = len(self.names) if self.names is not None else None
-        for k, mode in enumerate(modes):
-            if mode < 0 or (limit is not None and mode >= limit):
-                known = f"0 to {limit - 1} ({', '.join(self.names or ())})" if limit else "indices >= 0"
-                raise ValueError(f"schedule step {k}: unknown mode {mode}, expected {known}")
+        if min(modes) < 0 or (limit is not None and max(modes) >= limit):
+            k = next(k for k, mode in enumerate(modes) if mode < 0 or (limit is not None and mode >= limit))
+            known = f"0 to {limit - 1} ({', '.join(self.names or ())})" if limit else "indices >= 0"
+            raise ValueError(f"schedule step {k}: unknown mode {modes[k]}, expected {known}")
         object.__setattr__(self, "modes", modes)
 
     @classmethod

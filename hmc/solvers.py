@@ -89,6 +89,9 @@ class Search:
         while order.left > 0 or len(waiting) > 0:
             waiting = torch.cat([waiting, order.take(size - len(waiting))])
             room, limit = self.meter.room(len(waiting))
+            if room <= 0:
+                self.stopped_by = limit
+                return
             pairs = self._pairs(room) if beside else []
             single = self.space.neighbours(self.schedule, waiting[:room])
             batch: Tensor | Neighbours = single
