@@ -142,9 +142,8 @@ class MujocoSim:
             now[(now == then).all(1) & (now[:, self.model.nq :] != 0).any(1)] = np.nan
         if len(self._arrivals) > 1:
             self._ctrl[ids] = given[:, -1]
-        found = np.empty((len(at), given.shape[1], self.nx))
-        found[order] = states[:, self._substeps - 1 :: self._substeps]
-        return torch.from_numpy(found)
+        found = states[:, self._substeps - 1 :: self._substeps]
+        return torch.from_numpy(found if (order[1:] > order[:-1]).all() else found[order.argsort()])
 
     def save(self, ids: Ids = None) -> Tensor:
         return _copied(self._row, ids)
