@@ -89,7 +89,7 @@ class Search:
         while order.left > 0 or len(waiting) > 0:
             waiting = torch.cat([waiting, order.take(size - len(waiting))])
             room, limit = self.meter.room(len(waiting))
-            if room <= 0:
+            if room <= 0:  # what would be tried beside it is not worked out
                 self.stopped_by = limit
                 return
             pairs = self._pairs(room) if beside else []

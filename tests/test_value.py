@@ -107,6 +107,8 @@ def test_the_cost_of_lacking_value():
     assert found[:2, 1].tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
     assert float(found[2, 1]) == pytest.approx(4.0 * (1.0 - float(hand(x[2:3]))))
     assert float(found[3, 1]) == pytest.approx(4.0 * (1.0 - float(foot(x[3:4]))))
+    alone = [cost.terminal_terms(x[i : i + 1], k[i : i + 1])[0] for i in range(4)]
+    assert torch.equal(found, torch.stack(alone)), "a target for all takes another way to the same bits"
     assert cost.names == (*plain.names, "value")
 
 

@@ -62,18 +62,15 @@ class Value:
 
     def __call__(self, x: Tensor) -> Tensor:
         """Values of states x (n, 37), (n,)."""
-        q, on_cpu = x[:, 7:19], x.device.type == "cpu"
-        if on_cpu:  # in numpy: for few states a torch operation takes several times as long
+        q = x[:, 7:19]
+        torque = motor_torque(q, x[:, 25:37], q)
+        if x.device.type != "cpu":
+            output = self.on_device(seen(observe(x, q, anchor_of(x)), torque, x[:, 2]).float())
+        else:  # in numpy: for few states a torch operation takes several times as long
             state = x.numpy()
             obs = torch.from_numpy(network.observe(state, q.numpy(), network.anchor_of(state)))
-        else:
-            obs = observe(x, q, anchor_of(x))
-        obs = seen(obs, motor_torque(q, x[:, 25:37], q), x[:, 2]).float()
-        output = (
-            torch.from_numpy(self._session.run(None, {"obs": obs.numpy()})[0])
-            if on_cpu
-            else self.on_device(obs)
-        )
+            given = {"obs": seen(obs, torque, x[:, 2]).float().numpy()}
+            output = torch.from_numpy(self._session.run(None, given)[0])
         return output[:, 0].to(x) / self.rest
 
     def on_device(self, obs: Tensor) -> Tensor:

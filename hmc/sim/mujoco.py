@@ -141,7 +141,7 @@ class MujocoSim:
             now, then = states[row, 1:], states[row, :-1]
             now[(now == then).all(1) & (now[:, self.model.nq :] != 0).any(1)] = np.nan
         if len(self._arrivals) > 1:
-            self._ctrl[ids] = given[:, -1]
+            self._ctrl[ids.numpy()] = given[:, -1]
         found = states[:, self._substeps - 1 :: self._substeps]
         return torch.from_numpy(found if (order[1:] > order[:-1]).all() else found[order.argsort()])
 
