@@ -21,7 +21,7 @@ class ContactCfg:
 
     Attributes:
         on: force reading above its zero at which a foot begins to carry [counts, about 1 N].
-        off: below which it ends, likewise.
+        off: below which it ends, likewise; between the two it ends if the torques say that the foot hangs.
         load_on: normal force by joint torques at which a foot surely carries [N].
         load_off: below which it surely does not [N].
         zero_time: how fast a sensor's zero follows its reading while the foot surely hangs [s].
@@ -52,6 +52,11 @@ class FootContact:
         self._by_force = self._by_load = False
         self._zero = self._doubt = 0.0
 
+    @property
+    def firm(self) -> bool:
+        """Whether sensor and torques both say that the foot carries load."""
+        return self.contact and self._by_load
+
     def update(self, force: float, load: float, dt: float) -> bool:
         """One tick; whether the foot carries load.
 
@@ -66,7 +71,9 @@ class FootContact:
         self._by_load = carries or (self._by_load and not hangs)
         above = force - self._zero
         if came:
-            self._by_force = above > (cfg.off if self._by_force else cfg.on)
+            # a zero not yet known may lie between the two thresholds: there the torques tell the lift-off
+            held = self._by_force and not hangs
+            self._by_force = above > (cfg.off if held else cfg.on)
 
         # a sensor that contradicts clear torques for long is stuck; agreeing mends it, half as fast
         wrong = not came or (hangs if self._by_force else carries)

@@ -280,7 +280,9 @@ class Estimator:
                 ekf.release(i)
 
         self._carried = any(contact)
-        self._lost = self._lost + dt if self._carried and not ekf.stands.any() else 0.0
+        # by one sense alone a foot in the air may seem to carry, and what it does is no velocity to believe
+        firm = any(detector.firm for detector in self.detectors)
+        self._lost = self._lost + dt if firm and not ekf.stands.any() else 0.0
         if self._lost > cfg.lost:
             ekf.P[V, V] += cfg.lost_speed**2 * _I3
             self._lost = 0.0

@@ -32,6 +32,22 @@ def test_a_drifting_zero_is_followed_while_the_foot_hangs():
     assert foot.update(CFG.on + 20.0, 75.0, DT)
 
 
+def test_a_zero_between_the_thresholds_does_not_keep_a_hanging_foot_on_the_ground():
+    """It is not known before the foot first hangs; 16 counts would otherwise be a contact for good."""
+    foot, zero = FootContact(CFG), 0.5 * (CFG.on + CFG.off)
+    assert all(feed(foot, 75.0 + zero, 75.0, 1.0))
+    assert not any(feed(foot, zero, 0.0, 1.0))
+    assert not any(feed(foot, zero + CFG.off - 2.0, 0.0, 0.1)), "by now the zero is known"
+    assert all(feed(foot, 75.0 + zero, 75.0, 1.0))
+
+
+def test_contact_is_firm_if_both_senses_tell_it():
+    for force, load, firm in ((75.0, 75.0, True), (75.0, 0.0, False), (0.0, 75.0, False)):
+        foot = FootContact(CFG)
+        foot.update(force, load, DT)
+        assert foot.firm is firm
+
+
 def test_the_zero_does_not_follow_a_load():
     foot = FootContact(CFG)
     assert all(feed(foot, 30.0, 75.0, 5.0))

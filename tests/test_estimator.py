@@ -254,6 +254,21 @@ def test_flight_and_landing():
     assert e.position[2] == pytest.approx(robot.height, abs=0.01)
 
 
+@pytest.mark.parametrize("count", [16.0, 75.0])
+def test_a_sensor_that_still_tells_a_load_in_flight(count):
+    """Its zero is off, or it has stuck: a foot in the air that seems to carry tells no velocity."""
+    robot, estimator = stand("home", noise=1.0), Estimator()
+    robot.run(estimator, 0.6)
+    speed = 1.0
+    estimator.ekf.v = np.array([0.0, 0.0, speed])
+    start = estimator.ekf.r[2]
+    air = {"force": np.array([0.0, 0.0, count, 0.0]), "tau": np.zeros(12), "acc": np.zeros(3)}
+    e = robot.run(estimator, 0.2, **air)
+    assert e.velocity[2] == pytest.approx(speed - 9.81 * 0.2, abs=0.05)
+    assert estimator.ekf.r[2] - start == pytest.approx(speed * 0.2 - 0.5 * 9.81 * 0.2**2, abs=0.02)
+    assert math.sqrt(np.trace(e.velocity_covariance())) < 0.1, "and it is still sure of it"
+
+
 def test_a_lost_velocity_is_found_again():
     """All feet contradict the filter, for a wrong and overconfident velocity: it widens and gives in."""
     robot, estimator = stand("home", noise=1.0), Estimator()
