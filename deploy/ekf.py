@@ -59,7 +59,7 @@ _TINY = 1e-12
 _I3 = np.eye(3)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
 _NO_FORCE = _FIRM = ((0.0, 0.0),) * 4
-_STEADY = np.zeros(3)
+_STEADY = np.zeros(6)
 
 
 def foot(leg: int) -> slice:
@@ -96,6 +96,7 @@ class NoiseCfg:
         gyro: of a reading [rad/s].
         acc: of a reading [m/s^2].
         scale: of a reading, relative to what it reads beyond rest: coning, timing, scale factors.
+        sample: of what a shock does unseen between two accelerometer readings, relative to their difference.
         gyro_walk: of the gyroscope's bias [rad/s/sqrt(s)].
         acc_walk: of the accelerometer's bias [m/s^2/sqrt(s)].
         gyro_bias: of the gyroscope's bias before the first reading [rad/s].
@@ -117,6 +118,7 @@ class NoiseCfg:
     gyro: float = 0.01
     acc: float = 0.1
     scale: float = 0.01
+    sample: float = 0.15
     gyro_walk: float = 1.5e-4
     acc_walk: float = 1.5e-3
     gyro_bias: float = 0.003
@@ -124,8 +126,8 @@ class NoiseCfg:
     turn: float = 20.0
     jerk: float = 100.0
     foot: float = 0.0002
-    roll: float = 0.001
-    slide: float = 0.06
+    roll: float = 0.0008
+    slide: float = 0.04
     creep: float = 1e-3
     late: float = 1e-3
     creep_walk: float = 3e-4
@@ -220,19 +222,20 @@ class Ekf:
             pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
             loose: what a foot's place walks beyond a standing foot's, variance per time [m^2/s], 4 of
                 (horizontal, vertical).
-            change: of the gyroscope's reading since the last step [rad/s], (3,).
+            change: of the readings since the last step, gyroscope's then accelerometer's, (6,).
         """
         w, f = gyro - self.bw, acc - self.bf
-        phi = w * dt + self.late * change
+        phi = w * dt + self.late * change[:3]
         roll = (phi + turn) @ self.C.T
         rows = roll.tolist()
-        F = self.transition(f, rows, pull, change, dt)
+        F = self.transition(f, rows, pull, change[:3], dt)
         np.matmul(F, self.P, out=self._FP)
         P = np.matmul(self._FP, F.T)
         P += P.T
         P *= 0.5
         diagonal = P.reshape(-1)[:: N + 1]
         diagonal += self._walk(w, f, rows, pull, dt, 0.5 * gap * dt, loose)
+        diagonal[V] += (self.cfg.sample * dt * (self.C @ change[3:])) ** 2  # along the shock, not across it
         if jump is not None:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P

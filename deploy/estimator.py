@@ -147,7 +147,7 @@ class Estimator:
             return self._estimate
 
         leg = chains(self._q)
-        imu, jump, change = self._imu, None, self._imu[:3] - last[:3]
+        imu, jump, change = self._imu, None, self._imu - last
         if good and blind > 0.1 * self.cfg.period:
             # the gap gets the mean of the readings around it, the rest of the step its own
             jump = imu - last

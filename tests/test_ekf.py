@@ -70,7 +70,7 @@ def test_transition_by_finite_differences(seed):
     gyro, acc = 2.0 * rng.normal(size=3), 10.0 * rng.normal(size=3)
     dt, h = 1e-4, 1e-5
     turn, pull = dt * rng.normal(size=(4, 3)), 20.0 * rng.normal(size=(4, 2))
-    change = 10.0 * dt * rng.normal(size=3)
+    change = 10.0 * dt * rng.normal(size=6)
     numeric = np.zeros((N, N))
     for j in range(N):
         up, down = (plus(ekf, sign * h * np.eye(N)[j]) for sign in (1, -1))
@@ -78,8 +78,8 @@ def test_transition_by_finite_differences(seed):
             side.predict(gyro, acc, turn.tolist(), dt, pull=pull.tolist(), change=change)
         numeric[:, j] = minus(up, down) / (2 * h)
     w = gyro - ekf.bw
-    roll = (turn + w * dt + ekf.late * change) @ ekf.C.T
-    F = ekf.transition(acc - ekf.bf, roll.tolist(), pull.tolist(), change, dt)
+    roll = (turn + w * dt + ekf.late * change[:3]) @ ekf.C.T
+    F = ekf.transition(acc - ekf.bf, roll.tolist(), pull.tolist(), change[:3], dt)
     # to first order in dt: what is left is of the second
     np.testing.assert_allclose((F - np.eye(N)) / dt, (numeric - np.eye(N)) / dt, atol=5e-3)
 
@@ -165,12 +165,31 @@ def test_a_late_gyroscope_is_set_right():
         w = np.array([0.3 * (math.cos(10 * (k * dt - lag)) - math.cos(10 * ((k + 1) * dt - lag))) / dt, 0, 0])
         w[0] = 0.0 if k == 0 else w[0]
         for ekf in (right, wrong):
-            ekf.predict(w, -DOWN, NO_TURN, dt, change=w - last)
+            ekf.predict(w, -DOWN, NO_TURN, dt, change=np.concatenate([w - last, np.zeros(3)]))
         last = w.copy()
     angle = 0.3 * (1.0 - math.cos(10 * 79 * dt))
     found, lagging = (so3.log(ekf.q)[0] for ekf in (right, wrong))
     assert abs(found - angle) < 2e-4
     assert lagging - angle == pytest.approx(-3.0 * lag, abs=2e-4)
+
+
+def test_shocks_between_readings_are_no_surprise():
+    """Blows of 100 m/s^2 along a body's x for 2 to 10 ms, read as they are every 2 ms."""
+    rng, dt, nees = np.random.default_rng(0), 0.002, []
+    for _ in range(40):
+        ekf, edges = Ekf(NoiseCfg()), np.sort(rng.uniform(0.0, 0.1, 6))
+        ekf.q = so3.quaternion(np.array([0.0, 0.0, math.pi / 2]))  # its x is the world's y
+        ekf.C, ekf.P = so3.matrix(ekf.q), 1e-12 * np.eye(N)
+        last = -DOWN
+        for k in range(1, 51):
+            hit = bool(np.searchsorted(edges, k * dt) % 2)  # between every first and second edge
+            acc = -DOWN + [100.0 * hit, 0.0, 0.0]
+            ekf.predict(np.zeros(3), acc, NO_TURN, dt, change=np.concatenate([np.zeros(3), acc - last]))
+            last = acc
+        error = 100.0 * (edges[1::2] - edges[::2]).sum() - ekf.v[1]
+        nees.append(error**2 / ekf.P[V, V][1, 1])
+    assert 0.3 < np.mean(nees) < 6.0
+    assert ekf.P[V, V][2, 2] < 0.1 * ekf.P[V, V][1, 1], "along the blows alone"
 
 
 def test_a_thrown_body_flies_a_parabola():
