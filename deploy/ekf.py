@@ -110,7 +110,7 @@ class NoiseCfg:
         creep: of a foot's creep before the first reading [m/s/N].
         late: of how late the gyroscope reads [s].
         creep_walk: of its random walk, per square root of a second.
-        kinematics: of a foot's place by kinematics that changes from reading to reading [m].
+        kinematics: of a foot's place by kinematics [m]: wrong links and zeros err anew in each posture.
         ground: of the ground's height at a foothold [m].
         ground_time: for how long its errors stay the same [s].
     """
@@ -126,12 +126,12 @@ class NoiseCfg:
     turn: float = 20.0
     jerk: float = 100.0
     foot: float = 0.0002
-    roll: float = 0.0008
-    slide: float = 0.04
+    roll: float = 0.0004
+    slide: float = 0.02
     creep: float = 1e-3
     late: float = 1e-3
     creep_walk: float = 3e-4
-    kinematics: float = 0.0003
+    kinematics: float = 0.0008
     ground: float = 0.01
     ground_time: float = 1.0
 
