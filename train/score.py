@@ -24,7 +24,7 @@ class Score:
         n, p, z = self.episodes, self.rate, 1.959964
         middle = (p + z * z / (2 * n)) / (1 + z * z / n)
         half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-        return middle - half, middle + half
+        return max(middle - half, 0.0), min(middle + half, 1.0)  # the bounds themselves, but for rounding
 
     def __str__(self) -> str:
         low, high = self.interval
