@@ -39,13 +39,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deploy import so3
 from deploy.kinematics import FOOT_RADIUS
+from deploy.noise import NoiseCfg
 from deploy.so3 import Array, skew
 
 Flags = NDArray[np.bool_]
@@ -83,57 +83,6 @@ def distance(S: list[list[float]], e: Sequence[float], at: int = 0) -> float:
     y = (e[at + 1] - m * x) / o
     z = e[at + 2] - n * x - p * y
     return x * x + y * y + z * z / max(g - n * n - p * p, _TINY)
-
-
-@dataclass(frozen=True)
-class NoiseCfg:
-    """Standard deviations, all of them of one axis.
-
-    Those of readings are the simulated sensors'. Walks of the biases are half as large again as theirs, and
-    those of the feet were chosen so that the errors are as large as the filter says (docs/estimator.md).
-
-    Attributes:
-        gyro: of a reading [rad/s].
-        acc: of a reading [m/s^2].
-        scale: of a reading, relative to what it reads beyond rest: coning, timing, scale factors.
-        sample: of what a shock does unseen between two accelerometer readings, relative to their difference.
-        gyro_walk: of the gyroscope's bias [rad/s/sqrt(s)].
-        acc_walk: of the accelerometer's bias [m/s^2/sqrt(s)].
-        gyro_bias: of the gyroscope's bias before the first reading [rad/s].
-        acc_bias: of the accelerometer's, likewise [m/s^2].
-        turn: of the angular acceleration that a gap between readings hides [rad/s^2].
-        jerk: of the change of acceleration that it hides [m/s^3].
-        foot: of a standing foot's random walk [m/sqrt(s)]: yielding ground.
-        roll: of the walk that comes with the shank's turning [m/sqrt(rad)]: wrong links and joint zeros,
-            feet that are not quite spheres.
-        slide: of the walk that comes with creep, relative to its speed [sqrt(s)].
-        creep: of a foot's creep before the first reading [m/s/N].
-        late: of how late the gyroscope reads [s].
-        creep_walk: of its random walk, per square root of a second.
-        kinematics: of a foot's place by kinematics [m]: wrong links and zeros err anew in each posture.
-        ground: of the ground's height at a foothold [m].
-        ground_time: for how long its errors stay the same [s].
-    """
-
-    gyro: float = 0.01
-    acc: float = 0.1
-    scale: float = 0.01
-    sample: float = 0.15
-    gyro_walk: float = 1.5e-4
-    acc_walk: float = 1.5e-3
-    gyro_bias: float = 0.003
-    acc_bias: float = 0.03
-    turn: float = 20.0
-    jerk: float = 100.0
-    foot: float = 0.0002
-    roll: float = 0.0004
-    slide: float = 0.02
-    creep: float = 1e-3
-    late: float = 1e-3
-    creep_walk: float = 3e-4
-    kinematics: float = 0.0008
-    ground: float = 0.01
-    ground_time: float = 1.0
 
 
 class Ekf:

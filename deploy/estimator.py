@@ -9,9 +9,10 @@ import numpy as np
 
 from deploy import so3
 from deploy.contact import ContactCfg, Fall, FallCfg, FootContact
-from deploy.ekf import BF, BW, CREEP, GRAVITY, LATE, PHI, Ekf, Flags, NoiseCfg, R, V, distance
+from deploy.ekf import BF, BW, CREEP, GRAVITY, LATE, PHI, Ekf, Flags, R, V, distance
 from deploy.estimate import Estimate
 from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, lowest
+from deploy.noise import NoiseCfg
 from deploy.so3 import Array
 from deploy.start import Start, StartCfg
 

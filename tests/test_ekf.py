@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from deploy import so3
-from deploy.ekf import BF, BW, CREEP, FEET, GRAVITY, LATE, PHI, Ekf, N, NoiseCfg, R, V, distance, foot
+from deploy.ekf import BF, BW, CREEP, FEET, GRAVITY, LATE, PHI, Ekf, N, R, V, distance, foot
 from deploy.kinematics import FOOT_RADIUS
+from deploy.noise import NoiseCfg
 
 DOWN = np.array([0.0, 0.0, -GRAVITY])
 NO_TURN = [[0.0] * 3] * 4
