@@ -58,7 +58,7 @@ _ARM = 0.4  # m, from the IMU to a foot
 _TINY = 1e-12
 _I3 = np.eye(3)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
-_NO_FORCE = _FIRM = ((0.0, 0.0),) * 4
+_NO_FORCE = _FIRM = _FELT = ((0.0, 0.0),) * 4
 _STEADY = np.zeros(6)
 
 
@@ -157,6 +157,7 @@ class Ekf:
         jump: Array | None = None,
         pull: Rows = _NO_FORCE,
         loose: Rows = _FIRM,
+        unfelt: Rows = _FELT,
         change: Array = _STEADY,
     ) -> None:
         """Move on by dt.
@@ -171,6 +172,7 @@ class Ekf:
             pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
             loose: what a foot's place walks beyond a standing foot's, variance per time [m^2/s], 4 of
                 (horizontal, vertical).
+            unfelt: `deploy.kinematics.Chain.unfelt` along the ground in the world frame, 4 of 2.
             change: of the readings since the last step, gyroscope's then accelerometer's, (6,).
         """
         w, f = gyro - self.bw, acc - self.bf
@@ -188,6 +190,7 @@ class Ekf:
         if jump is not None:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P
+        self._drift(unfelt, dt)
 
         first, second = so3.carried(phi, f)
         dv = self.C @ (dt * first)
@@ -224,6 +227,19 @@ class Ekf:
             Q += (foot + across * dt, foot + across * dt, foot + down * dt)
         Q += (cfg.creep_walk**2 * dt, 0.0)
         return Q
+
+    def _drift(self, unfelt: Rows, dt: float) -> None:
+        """Widen P by what feet creep with forces that the torques do not tell, each along a line."""
+        creep = self.creep**2 + float(self.P[CREEP, CREEP])
+        walk = self.cfg.across**2 * creep * dt
+        for leg, stands in enumerate(self.stands.tolist()):
+            if stands:
+                x, y = unfelt[leg]
+                at = foot(leg).start
+                self.P[at, at] += walk * x * x
+                self.P[at, at + 1] += walk * x * y
+                self.P[at + 1, at] += walk * x * y
+                self.P[at + 1, at + 1] += walk * y * y
 
     def anchor(self, leg: int, s: Array) -> None:
         """A foot touches down: its position becomes what kinematics say.

@@ -113,6 +113,7 @@ class Estimator:
         self._refused = [0.0] * 4  # for how long each foot has been left out [s]
         self._lost = self._calm = 0.0
         self._pull = [(0.0, 0.0)] * 4  # horizontal force on each foot with contact [N]
+        self._unfelt = [(0.0, 0.0)] * 4  # what the torques do not tell of it
         # variance of the speed of each foot since it touched down, horizontal and vertical [m^2/s^2]
         self._moves = [(0.0, 0.0)] * 4
         self._fall, self._ticks, self._lowest = Fall(self.cfg.fall), 0, 0.0
@@ -154,9 +155,8 @@ class Estimator:
             jump = imu - last
             imu = imu - 0.5 * min(1.0, blind / dt) * jump
         turns = [chain.shank(*turned[3 * i : 3 * i + 3]) for i, chain in enumerate(leg)]
-        self.ekf.predict(
-            imu[:3], imu[3:], turns, dt, max(0.0, blind), jump, self._pull, self._loose(dt), change
-        )
+        gap, loose = max(0.0, blind), self._loose(dt)
+        self.ekf.predict(imu[:3], imu[3:], turns, dt, gap, jump, self._pull, loose, self._unfelt, change)
         if not (good or self._carried) and math.isfinite(float(acc.sum())):
             # a blow beyond the accelerometer's range, and no feet to tell what it did to the velocity
             self.ekf.P[V, V] += (2.0 * self.cfg.max_acc * dt) ** 2 * _I3
@@ -253,6 +253,7 @@ class Estimator:
             if not contact[i]:
                 continue
             self._pull[i] = (x, y) if math.isfinite(x + y) else (0.0, 0.0)
+            self._unfelt[i] = so3.rotated(C, chain.unfelt)[:2]
             u = self._slip(i, chain, C)
             if not self.contact[i]:
                 self._moves[i] = cfg.settle**2, (cfg.bounce * min(u[2], 0.0)) ** 2

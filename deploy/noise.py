@@ -27,6 +27,8 @@ class NoiseCfg:
         roll: of the walk that comes with the shank's turning [m/sqrt(rad)]: wrong links and joint zeros,
             feet that are not quite spheres.
         slide: of the walk that comes with creep, relative to its speed [sqrt(s)].
+        across: of the force across a leg that makes its foot creep, where the torques tell nothing of it, as
+            white noise [N sqrt(s)]: 13 N in a foot stand.
         creep: of a foot's creep before the first reading [m/s/N].
         late: of how late the gyroscope reads [s].
         creep_walk: of its random walk, per square root of a second.
@@ -47,7 +49,8 @@ class NoiseCfg:
     jerk: float = 100.0
     foot: float = 0.0002
     roll: float = 0.0004
-    slide: float = 0.02
+    slide: float = 0.01
+    across: float = 2.2
     creep: float = 1e-3
     late: float = 1e-3
     creep_walk: float = 3e-4

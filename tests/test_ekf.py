@@ -265,6 +265,19 @@ def test_a_foot_that_has_just_landed_walks_more():
     np.testing.assert_allclose(more, [walked, walked, [0] * 3, [0] * 3], atol=1e-15)
 
 
+def test_a_foot_under_a_force_that_is_not_known_may_creep_along_it():
+    known, blind = random_filter(), random_filter()
+    known.creep = blind.creep = 2e-3
+    unfelt = [(0.6, 0.8), (0.0, 0.0), (1.0, 1.0), (0.0, -1.0)]
+    known.predict(np.zeros(3), -DOWN, NO_TURN, 0.002)
+    blind.predict(np.zeros(3), -DOWN, NO_TURN, 0.002, unfelt=unfelt)
+    expected, square = np.zeros((N, N)), 2e-3**2 + known.P[CREEP, CREEP]  # of the creep, its doubt with it
+    for leg in (0, 1, 3):  # the third hangs
+        line = np.array([*unfelt[leg], 0.0])
+        expected[foot(leg), foot(leg)] = 0.002 * NoiseCfg().across ** 2 * square * np.outer(line, line)
+    np.testing.assert_allclose(blind.P - known.P, expected, rtol=0, atol=1e-15)
+
+
 def test_an_anchor_is_an_update_of_a_foot_of_which_nothing_was_known():
     ekf, s = random_filter(4, stands=(True, False, False, False)), np.array([0.2, -0.1, -0.3])
     other = copy.deepcopy(ekf)
