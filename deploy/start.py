@@ -161,8 +161,9 @@ class Start:
         if np.linalg.norm(rate) > cfg.max_rate or abs(np.linalg.norm(force) - 9.81) > cfg.max_acc:
             return None
         white = self._noise**2
-        # what turns more than noise is a stand that sways, slower than the mean could tell
-        sway = 4.0 * np.maximum(gyro.var(0) - white, 0.0) + cfg.rate**2
+        # what turns more than noise is a stand that sways, slower than the mean could tell; a steady turn
+        # does not vary, and is no bias either
+        sway = 4.0 * np.maximum(gyro.var(0) - white, 0.0) + rate**2 + cfg.rate**2
         return Stood(
             force,
             math.sqrt(_CORRELATED * error**2 / spread + cfg.acc**2),

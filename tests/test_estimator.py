@@ -119,6 +119,16 @@ def test_a_body_that_lies_has_a_start_and_one_that_tumbles_has_none():
             np.testing.assert_allclose(stood[0].velocity, 0.0, atol=1e-9)
 
 
+def test_a_steady_turn_at_the_start_is_no_bias():
+    start, stood = Start(StartCfg(), 0.01), None
+    while stood is None:
+        imu = np.array([0.0, 0.0, 0.4, 0.0, 0.0, 9.81])
+        stood = start.take(imu, 0.002, stand("home").q.tolist(), [0.0] * 12, [False] * 4)
+    error = np.sqrt(stood.rate_variance)
+    assert error[2] > 0.4
+    assert (error[:2] < 0.006).all(), "about the other axes it stands still"
+
+
 def test_a_duplicate_and_an_old_tick_change_nothing():
     robot, estimator = stand("home", noise=1.0), Estimator()
     e = robot.run(estimator, 0.5)
