@@ -48,7 +48,7 @@ def test_shapes():
     assert done.dtype == extras["time_outs"].dtype == torch.bool
     assert (env.num_envs, env.num_actions, env.max_episode_length) == (8, 12, 20)
     terms = [name for name in extras["log"] if name.startswith("/reward/")]
-    assert len(terms) == 11
+    assert len(terms) == 12
     assert {name for name in extras["log"] if name.startswith("/success/")} == {
         "/success/stance", "/success/way", "/success/home", "/success/frontier",
     }  # fmt: skip
