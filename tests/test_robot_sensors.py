@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deploy import so3
+from deploy.kinematics import IMU
 from deploy.remote import Button, Remote, unpack
 from tests.robots import STAND, last, ready
 from tools.robot.sensors import CLEAN, Battery, Feet, Imu, Sensors, roll_pitch_yaw
@@ -23,10 +25,31 @@ def test_clean_state_is_the_truth() -> None:
     assert state.dq == pytest.approx(truth.qvel[6:], abs=1e-6)
     assert state.tau == pytest.approx(truth.torque, abs=1e-5)
     assert state.quat == pytest.approx(truth.qpos[3:7], abs=1e-6)
-    assert state.gyro == pytest.approx(truth.qvel[3:6], abs=1e-6)
+    assert state.gyro == pytest.approx(truth.qvel[3:6], abs=1e-3)
     assert state.foot_force.tolist() == np.round(truth.foot_force).tolist()
     assert truth.foot_force.sum() == pytest.approx(15.2 * 9.81, rel=0.1)
     assert state.acc == pytest.approx([0, 0, 9.81], abs=0.5)
+
+
+def test_imu_adds_up_to_how_the_robot_turned_and_sped_up() -> None:
+    """Also across a shock, which is over between two readings: the robot is dropped onto its feet."""
+    robot = ready()
+    robot.push([0.0, 0.0, 500.0], 0.1)
+    last(robot, [STAND], 60)
+    begin, place = robot.truth(), np.array([*IMU])
+    turn, gained, peak = begin.qpos[3:7].copy(), np.zeros(3), 0.0
+    for _ in range(300):
+        state, C = last(robot, [STAND], 1), so3.matrix(turn)
+        gained += PERIOD * (C @ state.acc - [0.0, 0.0, 9.81])
+        turn, _ = so3.turned(turn, PERIOD * state.gyro)
+        peak = max(peak, float(np.linalg.norm(state.acc)))
+    end = robot.truth()
+    velocity = [
+        each.qvel[:3] + so3.matrix(each.qpos[3:7]) @ np.cross(each.qvel[3:6], place) for each in (begin, end)
+    ]
+    assert peak > 30.0, "no shock"
+    assert np.abs(so3.log(so3.multiply(turn * [1, -1, -1, -1], end.qpos[3:7]))).max() < 1e-4
+    assert gained == pytest.approx(velocity[1] - velocity[0], abs=0.02)
 
 
 def test_imu_errors_have_their_sizes() -> None:

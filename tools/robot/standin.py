@@ -124,6 +124,7 @@ class StandIn:
         self._strict, self._loss_after = settings.strict, settings.loss_after
         self.loss: Loss = settings.loss
         self._push, self._push_until = np.zeros(3), 0.0
+        self._mean = np.zeros(6)  # rate [rad/s] and specific force [m/s^2] over a period: an IMU adds up
 
         start = _start(settings.start)
         self._data.qpos[:] = start
@@ -164,6 +165,7 @@ class StandIn:
         """
         for frame in self.commands.send(frames):
             self._receive(frame)
+        self._mean[:] = 0.0
         for _ in range(SUBSTEPS):
             self._physics()
         self.motors.warm(PERIOD)
@@ -229,6 +231,8 @@ class StandIn:
         data.qfrc_applied[6:] = self.motors.drive(self._active(), self._encoders.angle(q), dq)
         data.xfrc_applied[1, :3] = self._push if self.time < self._push_until else 0.0
         mujoco.mj_step(self._model, data)
+        # that rate turned the body in this step, that specific force changed its velocity
+        self._mean += np.concatenate([data.qvel[3:6], data.sensordata[3:6]]) / SUBSTEPS
         if not np.isfinite(data.qpos).all():
             raise RuntimeError(
                 f"the simulated robot diverged at {self.time:.3f} s: are the last command's gains too high?"
@@ -236,9 +240,8 @@ class StandIn:
 
     def _measure(self) -> RobotState:
         data = self._data
-        mujoco.mj_forward(self._model, data)  # or the IMU would be a step behind the encoders
-        sensed = data.sensordata
-        quat, gyro, acc = self._imu.read(self.time, PERIOD, data.qpos[3:7], sensed[:3], sensed[3:6])
+        mujoco.mj_forward(self._model, data)  # or the feet would be a step behind the encoders
+        quat, gyro, acc = self._imu.read(self.time, PERIOD, data.qpos[3:7], self._mean[:3], self._mean[3:])
         q, dq, torque = self._encoders.told(data.qpos[7:], data.qvel[6:], self.motors.torque)
         return RobotState(
             tick=self._tick,
@@ -251,7 +254,7 @@ class StandIn:
             tau=torque,
             mode=self._active().mode,
             temperature=np.round(self.motors.temperature).astype(np.int64),
-            foot_force=self.feet.read(sensed[6:10], PERIOD),
+            foot_force=self.feet.read(data.sensordata[6:10], PERIOD),
             remote=pack(self.remote),
             charge=self._battery.charge,
             current=round(1000 * self._battery.current),
