@@ -22,7 +22,7 @@ from hmc.go2.model import HOME, Q_LOWER, Q_UPPER, SUBSTEPS, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, jump_mode, policy_path
 from hmc.memory import make_worlds
-from hmc.sim.cuda import capture, graphs, num_bytes
+from hmc.sim.cuda import Recorded, graphs, num_bytes
 from hmc.sim.device import devices, find_device, free_memory
 from hmc.sim.make import make_sim
 from hmc.sim.warp import WarpSim
@@ -138,7 +138,7 @@ class Bare:
         self.qpos, self.qvel = wp.to_torch(self.data.qpos), wp.to_torch(self.data.qvel)
         self.ctrl = wp.to_torch(self.data.ctrl)
         captured, self.model.opt.graph_conditional = graphs(sim.device)
-        self.graph = capture(self._substeps, self.device) if captured else None
+        self.substeps = Recorded(self._substeps, self.device, captured)
 
     def reset(self, x: Tensor) -> None:
         """Begin at states (W, nx)."""
@@ -150,12 +150,7 @@ class Bare:
     def step(self, u: Tensor) -> None:
         """One control step."""
         self.ctrl[:] = u
-        stream = wp.stream_from_torch(torch.cuda.current_stream(u.device)) if u.is_cuda else None
-        if self.graph is not None:
-            wp.capture_launch(self.graph, stream=stream)
-            return
-        with wp.ScopedStream(stream):
-            self._substeps()
+        self.substeps()
 
     def _substeps(self) -> None:
         with wp.ScopedDevice(self.device):
