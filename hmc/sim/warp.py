@@ -138,6 +138,7 @@ class WarpSim:
         self._arrivals = sorted({0, *late} - {substeps})  # physics steps that inputs come at
         self._one = self._data(1)  # a world's arrays, to see what so many take
         check_memory(self._one, num_worlds, self._device)
+        wp.synchronize_device(self._on_warp)  # filled on a stream of Warp's, read on torch's
         first = fields(self._one, FIELDS)
         self._slices = slices({name: field.shape[1] for name, field in first.items()})
         self._moving = slice(self._slices["qpos"].start, self._slices["qvel"].stop)
