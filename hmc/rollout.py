@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hmc.account import Account
 from hmc.branches import Branches, tree_of
 from hmc.cost import total_by_term
 from hmc.neighbours import Neighbours
 from hmc.sim.device import upload
-from hmc.sim.ids import Ids, blocks, joined
+from hmc.sim.ids import Ids, blocks
 from hmc.trace import Floats, Recorder, Traces
 from hmc.worlds import Crew, Flags, Indices, Worlds, finite
 
@@ -124,23 +125,21 @@ class _Rollout:
         self.terms = np.full((len(task.cost.names), n * self.members), math.nan)  # of those that arrived
         self.result = np.full(n, math.inf)
         self.pruned, self.barred = np.zeros((2, n), dtype=bool)
-        self._sums = np.empty((self.stages, n * self.members))
         self.cheap = bool(getattr(worlds.sim, "cheap", False))
         self._go_on(slice(0, 0))  # a slice while none has ended
         self.crew: Crew | None = None  # who acts in them; None: to be found out
         self.changes = [True, *(self.modes[1:] != self.modes[:-1]).any(1).tolist()]
-        # of the last steps who made them, x, u and u before; and after how many of these worlds were born
-        self.unpriced: list[tuple[np.ndarray | slice, Tensor, Tensor, Tensor]] = []
-        self.births: list[tuple[int, slice, Indices]] = []
         # what cannot end a branch on the way is looked at now and then only
-        watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
-        # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost
-        self.later = far(self.sim.device) and not watchful and self.stages > 0
+        self.watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
+        # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost,
+        # and that is looked at together with what guards and bounds say
+        self.later = far(self.sim.device) and self.stages > 0
+        self.account = Account(task, n * self.members, self.sim.dt, self.recorder, self.later)
         self.constant = task.modes.constants is not None
         self.rows = MANY_ROWS if self.cheap or self.later else ROWS
         # what steps cost can wait where nothing is given up for it
         patient = self.limit == math.inf and not self.later
-        self.at_once = 1 if watchful else self.rows if patient else STEPS
+        self.at_once = 1 if self.watchful and not self.later else self.rows if patient else STEPS
         # what is beyond its limit has no children, where to find out takes less time than to step those
         self.before_births = not (self.cheap or self.later or patient)
 
@@ -149,7 +148,7 @@ class _Rollout:
         sim, k, born = self.sim, self.first + i, self.tree.born
         if i == self.horizon or born[i + 1] > born[i]:
             if i == self.horizon or self.before_births:
-                self._price(k)
+                self._price()
             self._grow(i)
         if self.size == 0:
             return
@@ -158,12 +157,12 @@ class _Rollout:
             self.recorder.arrive(self.worlds, i, self.ids, self.at, x, u_prev)
         look = i == self.horizon or not self.later
         if look and not math.isfinite(float(x.sum())):  # a finite sum has finite parts
-            x, u_prev = self._price(k, x, u_prev)
+            x, u_prev = self._price(x, u_prev)
             x, u_prev = self._drop(~self._all(finite(x).cpu().numpy()), x, u_prev)
         if i == self.horizon:
             self._arrive(x, k)
             return
-        if self.size > 0 and self.at_once == 1:
+        if self.size > 0 and self.watchful:
             x, u_prev = self._give_up(i, x, u_prev)
         if self.size == 0:
             return
@@ -171,10 +170,10 @@ class _Rollout:
             modes = self._each(self.modes[i, self.ids])
             self.crew = self.worlds.crew(self.at, modes, modes if self.constant else self._before(i))
         u = self.worlds.act(self.crew, x, u_prev, k)
-        self.unpriced.append((self.ids, x, u, u_prev))
+        self.account.step(i, self.ids, x, u, u_prev)
         fine = self.later or self.crew.held is not None or math.isfinite(float(u.sum()))
-        if not fine or len(self.unpriced) >= min(self.at_once, self.rows // self.size // self.members):
-            (u,) = self._price(k + 1, u, sane=None if fine else self._all(finite(u).cpu().numpy()))
+        if not fine or (self._due and not (self.later and self.watchful)):
+            (u,) = self._price(u, sane=None if fine else self._all(finite(u).cpu().numpy()))
         if self.size > 0:
             sim.step(u, self._at)
             self.worlds.own_steps += self.size * self.members
@@ -211,13 +210,18 @@ class _Rollout:
         )
 
     @property
+    def _due(self) -> bool:
+        """Whether it is time to find out what the last steps cost."""
+        return len(self.account) >= min(self.at_once, self.rows // self.size // self.members)
+
+    @property
     def _indices(self) -> np.ndarray:
         return np.arange(self.ids.stop) if isinstance(self.ids, slice) else self.ids
 
     @property
     def sums(self) -> Floats:
         """Stage terms of the worlds of `at` so far, (number of stage terms, len(at))."""
-        return self._sums[:, : self.size * self.members]
+        return self.account.sums[:, : self.size * self.members]
 
     def _device(self, indices: np.ndarray) -> Tensor:
         return upload(indices, self.sim.device)
@@ -269,7 +273,7 @@ class _Rollout:
         for member, trunk in enumerate(self.trunk if seeds > old else ()):
             begin = width if self.cheap else old * members
             self.worlds.enter(trunk, i, slice(begin + member, begin + grown - width, members))
-            self._sums[:, width + member : grown : members] = trunk.sums[i].numpy()[:, None]
+            self.account.sums[:, width + member : grown : members] = trunk.sums[i].numpy()[:, None]
         stems, born = self.parents[seeds:now], np.arange(old, now)
         ids: Indices | slice = slice(0, now)
         places = stems
@@ -285,22 +289,13 @@ class _Rollout:
         self._go_on(ids)
         if len(stems) > 0:
             children = slice(grown // members, grown // members + len(stems))
-            self.births.append(
-                (len(self.unpriced), slice(grown, grown + len(stems) * members), self._blocks(places))
-            )
-            if not self.unpriced:
-                self._inherit()
+            width = len(stems) * members
+            self.account.born(slice(grown, grown + width), self._blocks(places))
             there = self.cheap or isinstance(ids, slice)
             self.worlds.branch(
                 self._device(self._blocks(places if self.cheap else stems)),
                 blocks(children if there else self._device(born[seeds - old :]), members),
             )
-
-    def _inherit(self) -> None:
-        """Give worlds the sums of those that they were born from, where these are known by now."""
-        while self.births and self.births[0][0] == 0:
-            _, children, parents = self.births.pop(0)
-            self._sums[:, children] = self._sums.take(parents, 1)
 
     def _arrive(self, x: Tensor, k: int) -> None:
         """The end at control step k, of worlds in states x: what they cost."""
@@ -312,52 +307,57 @@ class _Rollout:
         self.terms[:, self._blocks(self._indices)] = terms
         self.result[self.ids] = np.where(self._all(np.isfinite(costs)), self._risk(costs), math.inf)
 
-    def _price(self, k: int, *rows: Tensor, sane: Flags | None = None) -> tuple[Tensor, ...]:
-        """Add what the last steps cost, the last one that before control step k, and end the branches that
-        are beyond their limit, no number, or not `sane` (n,); the `rows`, (n E, ...) each, of the others."""
-        if not self.unpriced:
+    def _price(self, *rows: Tensor, sane: Flags | None = None) -> tuple[Tensor, ...]:
+        """Find out what the last steps cost, and end whom `_settle` ends; the `rows` of the others."""
+        if not len(self.account):
             return rows
-        steps, self.unpriced = self.unpriced, []
-        widths, first = [x.shape[0] for _, x, _, _ in steps], k - len(steps)
-        x, u, u_prev = map(joined, zip(*[step[1:] for step in steps], strict=True))
-        ks = upload(np.arange(first, k).repeat(widths), x.device)
-        found = self.task.cost.stage_terms(x, u, u_prev, ks).to(torch.float64)
-        if self.later:
-            found = found.masked_fill(~(finite(x) & finite(u))[:, None], math.nan)
-        terms, done = found.cpu().numpy().T, 0
-        terms *= self.sim.dt
-        for (ids, *_), width in zip(steps, widths, strict=True):
-            stage = terms[:, done : done + width]
-            done += width
-            sums = self._sums[:, :width]
-            sums += stage
-            if self.recorder is not None:
-                self.recorder.step(first - self.first, ids, stage)
-            first += 1
-            self.births = [(after - 1, born, of) for after, born, of in self.births]
-            self._inherit()
-        costs = total_by_term(self.sums)
-        partial = self._risk(costs)
-        if sane is not None or not math.isfinite(costs.sum()) or partial.max() > self.limit:
-            fine = self._all(np.isfinite(costs))
+        return self._settle(self.account.costs(self.first).cpu().numpy(), *rows, sane=sane)
+
+    def _settle(self, costs: Floats, *rows: Tensor, sane: Flags | None = None) -> tuple[Tensor, ...]:
+        """Add what the last steps cost, and end the branches that are beyond their limit, no number, or not
+        `sane` (n,); the `rows`, (n E, ...) each, of the others."""
+        self.account.settle(costs)
+        total = total_by_term(self.sums)
+        partial = self._risk(total)
+        if sane is not None or not math.isfinite(total.sum()) or partial.max() > self.limit:
+            fine = self._all(np.isfinite(total))
             return self._prune(partial, fine if sane is None else fine & sane, *rows)
         return rows
 
     def _give_up(self, i: int, x: Tensor, u: Tensor) -> tuple[Tensor, ...]:
-        """End what a guard bars and what is sure to exceed its limit; states and inputs of the others."""
-        rules, rest, k = self.task.rules, self.task.lower_bound, self.first + i
+        """End what a guard bars and what is sure to exceed its limit; states and inputs of the others.
+
+        What is to be known for that is fetched at once, what the last steps cost included.
+        """
+        rules, rest, k, there = self.task.rules, self.task.lower_bound, self.first + i, self._indices
+        modes, barred, least = self._each(self.modes[i, self.ids]), None, None
         if rules is not None and rules.guards:
-            bad = self.worlds.barred(self._each(self.modes[i, self.ids]), self._before(i), x, k)
-            bad = ~self._all(~bad)
-            if bad.any():
-                self.barred[self._indices[bad]] = True
-                x, u = self._drop(bad, x, u)
-        if rest is not None and self.limit < math.inf and len(x) > 0:
-            steps = torch.full((len(x),), k, device=x.device)
-            least = total_by_term(self.sums) - self.slack
-            least += rest(x, steps, self.horizon - i).to(torch.float64).cpu().numpy()
+            barred = rules.barred(self.task.modes, modes != self._before(i), modes, x, k)
+        if rest is not None and self.limit < math.inf:
+            least = rest(x, torch.full((len(x),), k, device=x.device), self.horizon - i)
+        if barred is None and least is None and not (self.later and self._due):
+            return x, u
+        costs = self.account.costs(self.first) if len(self.account) else None
+        sane = finite(x) if self.later else None
+        known = fetched(costs, sane, barred, least)
+
+        def of_those_left(numbers: Floats) -> Floats:
+            mine: Floats = numbers.reshape(len(there), -1)[there.searchsorted(self._indices)].ravel()
+            return mine
+
+        if costs is not None:
+            x, u = self._settle(known[0].reshape(costs.shape), x, u)
+        if sane is not None:
+            x, u = self._drop(~self._all(of_those_left(known[1]) > 0), x, u)
+        if barred is not None:
+            bad = ~self._all(of_those_left(known[2]) == 0)
+            self.barred[self._indices[bad]] = True
+            x, u = self._drop(bad, x, u)
+        if least is not None and len(x) > 0:
+            bound = total_by_term(self.sums) - self.slack
+            bound += of_those_left(known[3])
             # hopeless is pruned as well, and a bound that is no number bounds nothing
-            risk = self._risk(np.nan_to_num(least, nan=0.0, posinf=math.inf, neginf=-math.inf))
+            risk = self._risk(np.nan_to_num(bound, nan=0.0, posinf=math.inf, neginf=-math.inf))
             if risk.max() > self.limit:
                 x, u = self._prune(risk, np.ones(len(risk), dtype=bool), x, u)
         return x, u
@@ -375,7 +375,7 @@ class _Rollout:
         """End those branches that are `bad` (n,); of `rows`, (n E, ...) each, those of the others."""
         if bad.any():
             good = np.flatnonzero(self._each(~bad))
-            self._sums[:, : len(good)] = self._sums.take(good, 1)
+            self.account.keep(good)
             self._go_on(self._indices[~bad])
             chosen = self._device(good)
             if self.cheap:  # to close up takes less time than to pick them out at every step
@@ -387,3 +387,11 @@ class _Rollout:
 def far(device: torch.device) -> bool:
     """Whether to look at a number on a device is to wait for all that it was told to do before."""
     return device.type != "cpu"
+
+
+def fetched(*numbers: Tensor | None) -> list[Floats]:
+    """Tensors of a device, flat and in double precision, in one copy; nothing for None."""
+    given = [each if each is None else each.to(torch.float64).flatten() for each in numbers]
+    sizes = [0 if each is None else len(each) for each in given]
+    here = torch.cat([each for each in given if each is not None]).cpu().numpy()
+    return np.split(here, np.cumsum(sizes)[:-1])

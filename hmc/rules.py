@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.modes import ModeSet
+from hmc.sim.device import upload
 
 Guard = Callable[[Tensor, Tensor], Tensor]
 
@@ -79,19 +82,23 @@ class Rules:
             bad |= (change & (step - since < fewest[before])).any(1)
         return bad
 
-    def barred(self, modes: ModeSet, entered: Tensor, chosen: Tensor, x: Tensor, k: Tensor) -> Tensor:
-        """Which worlds enter a mode whose guard says no, (n,) bool.
+    def barred(
+        self, modes: ModeSet, entered: NDArray[np.bool_], chosen: NDArray[np.integer], x: Tensor, k: int
+    ) -> Tensor | None:
+        """Which worlds enter a mode whose guard says no, (n,) bool where x is; None where no guard is asked.
 
         Args:
             modes: what the indices mean.
-            entered: whether a world enters its mode at this step, (n,) bool.
-            chosen: its mode, (n,) long.
+            entered: whether a world enters its mode at this step, (n,).
+            chosen: its mode, (n,).
             x: its state, (n, nx).
-            k: control step, (n,).
+            k: control step.
         """
-        bad = torch.zeros_like(entered)
+        bad = None
         for name, guard in self.guards.items():
-            rows = (entered & (chosen == modes.index(name))).nonzero().squeeze(1)
-            if len(rows) > 0:
-                bad[rows] = ~guard(x[rows], k[rows])
+            found = np.flatnonzero(entered & (chosen == modes.index(name)))
+            if len(found) > 0:
+                rows = upload(found, x.device)
+                bad = torch.zeros(len(x), dtype=torch.bool, device=x.device) if bad is None else bad
+                bad[rows] = ~guard(x.index_select(0, rows), torch.full_like(rows, k))
         return bad

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.cost import Cost, total
@@ -165,8 +167,8 @@ class SamplingMpc(Mode):
     Memory: the knots, then the number of steps taken since entry. The last `MEMO` re-plans are kept:
     the same situation is never rolled out twice.
 
-    On a GPU a step waits for the device once, to learn in how many worlds it re-plans, and if in any, once
-    more for their situations: what is known already is not rolled out. The re-plan itself does not wait.
+    On a GPU a step waits for the device once, to learn in which worlds it re-plans, and whether their
+    situations are known: then they are not rolled out. The re-plan itself does not wait.
 
     Args:
         name: of the mode.
@@ -219,12 +221,15 @@ class SamplingMpc(Mode):
         n = len(x)
         theta = memory[:, :-1].reshape(n, self.cfg.knots, self.nu).clone()
         taken = memory[:, -1]
-        phase = taken.long() % self.cfg.replan_every
-        now = (phase == 0).nonzero().squeeze(1)
-        if len(now):
-            shifted = self._shift(theta[now], taken[now])
-            theta[now] = self._replan_known(x[now], u[now], shifted, k[now])
-        its = self._constants(x)
+        # all that the host must know, in one copy
+        situations = torch.cat([taken[:, None], k[:, None].to(x), x, u, memory[:, :-1]], 1)
+        rows = situations.cpu().contiguous().numpy()
+        due = np.flatnonzero(rows[:, 0].astype(np.int64) % self.cfg.replan_every == 0)
+        if len(due):
+            now = upload(due, x.device)
+            moved = self._shift(theta[now], taken[now]) if rows[due, 0].any() else theta[now]
+            theta[now] = self._replan_known(rows[due], x[now], u[now], moved)
+        its, phase = self._constants(x), taken.long() % self.cfg.replan_every
         action = (its.spline[phase][:, None] @ theta).squeeze(1).clamp(its.lower, its.upper)
         return action, torch.cat([theta.reshape(n, -1), (taken + 1)[:, None]], 1)
 
@@ -282,22 +287,19 @@ class SamplingMpc(Mode):
     def _shift(self, theta: Tensor, taken: Tensor) -> Tensor:
         """Plans `replan_every` steps later; what newly appears comes from the guess, else holds."""
         its, moving = self._constants(theta), taken > 0
-        if theta.device.type == "cpu" and not moving.any():  # to look is to wait elsewhere
-            return theta
         moved = its.later @ theta
         if its.guess is not None:
             moved = torch.cat([moved[:, : its.inside], self._prior(theta, taken, its.inside)], 1)
         return torch.where(moving[:, None, None], moved, theta)
 
-    def _replan_known(self, x: Tensor, u: Tensor, theta: Tensor, k: Tensor) -> Tensor:
-        """`_replan`, once for each situation: schedules with a common beginning share it, and a search
-        comes back to the same beginnings again and again."""
-        rows = torch.cat([x, u, theta.reshape(len(x), -1), k[:, None].to(x)], 1).cpu().contiguous().numpy()
+    def _replan_known(self, rows: NDArray[Any], x: Tensor, u: Tensor, theta: Tensor) -> Tensor:
+        """`_replan`, once for each situation (n, ...) of `rows`, whose second number is k: schedules with a
+        common beginning share it, and a search comes back to the same beginnings again and again."""
         keys = [row.tobytes() for row in rows]
         new = {key: i for i, key in enumerate(keys) if key not in self._known}
         if new:
             first = list(new.values())
-            at, steps = upload(np.array(first), x.device), torch.from_numpy(rows[first, -1]).long()
+            at, steps = upload(np.array(first), x.device), torch.from_numpy(rows[first, 1]).long()
             found = self._replan(x[at], u[at], theta[at], steps)
             self._known.update(zip(new, found, strict=True))
         plans = torch.stack([self._known[key] for key in keys])

@@ -71,14 +71,6 @@ class Worlds:
         if self.task.modes.memory_size > 0:
             self.memory[where(children)] = self.memory[where(parents)]
 
-    def barred(self, modes: Indices, before: Indices, x: Tensor, k: int) -> Flags:
-        """Which of n worlds enter a mode that the task's guards bar, (n,) bool; arguments as of `crew`."""
-        rules = self.task.rules
-        assert rules is not None
-        entered, chosen = (upload(a, x.device) for a in (modes != before, modes.astype(np.int64)))
-        barred = rules.barred(self.task.modes, entered, chosen, x, torch.full_like(chosen, k))
-        return barred.cpu().numpy()
-
     def crew(self, ids: Ids, modes: Indices, before: Indices) -> Crew:
         """Who acts in worlds `ids`: it holds until these or their modes change.
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.tiny import CFG, make_env, make_runner
 from tools.bench import main
+from tools.benchmarks import learning
 from tools.benchmarks.engine import Engine
 from tools.benchmarks.figures import AT_LEAST, AT_MOST, Common, Figures
 from tools.benchmarks.gpu import Gpu
@@ -19,6 +22,8 @@ from tools.benchmarks.planner import Planner
 from tools.benchmarks.train import Train
 from tools.benchmarks.wire import Wire
 from tools.random_policy import write_random_policy
+from train import ppo
+from train.runner import read_checkpoint
 
 SMALL = {
     "engine": (
@@ -55,6 +60,8 @@ SMALL = {
             "arrays_4_kb",
             "env_4_efficiency",
             "train_4_steps_per_s",
+            "train_4_minutes",
+            "train_4_msteps",
             "exact_t3_ms",
             "exact_t3_efficiency",
             "exact_t3_candidates_per_s",
@@ -104,6 +111,13 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         expected = expected | {"go2_tick_ms_p50", "go2_tick_ms_p99", "go2_control_steps_fraction"}
         expected = expected | {"ensemble_3_fraction", "ensemble_5_fraction"}
 
+    if name == "gpu":  # beside a run of another engine
+        runner = make_runner(tmp_path / "cpu")
+        runner.last_iteration = 1
+        ppo.train(runner, tmp_path / "cpu")
+        args = Gpu(**{**vars(args), "out": tmp_path / "runs", "cpu": tmp_path / "cpu"})
+        expected = expected | {"train_cpu_minutes", "train_cpu_msteps"}
+
     assert main(type(args)(**{**vars(args), "json": out})) == 0
 
     written = json.loads(out.read_text())
@@ -122,8 +136,26 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         targets = {name for name in (*AT_LEAST, *AT_MOST) if re.search(r"_(4096|8192|t75)", name)}
         missing = {name for name, value in written.items() if value == "not measured"}
         assert len(targets) == 6
+        assert (tmp_path / "runs" / "learning.png").stat().st_size > 0
         assert targets | {"step_8192_bare_steps_per_s", "crossover_c1_switches"} <= missing
         assert said.count("not measured") == len(missing)
+
+
+@pytest.mark.parametrize(("level", "iterations"), [(0.0, 1), (1.1, 3)])
+def test_training_ends_with_its_success(level: float, iterations: int, tmp_path: Path) -> None:
+    """Or with its last iteration; a run that was there before does not count."""
+    cfg = replace(CFG, ppo=replace(CFG.ppo, iterations=3))
+    for _ in range(2):
+        run = learning.train_until(level, cfg, make_env(), tmp_path / "run", ["--mode", "handstand"])
+    assert read_checkpoint(tmp_path / "run" / "latest.pt")["iter"] == iterations - 1
+    assert run.lines[learning.TAG][0].tolist() == list(range(iterations))
+    figures = Figures()
+    learning.tell(figures, "train", run, level)
+    if level > 1:
+        assert figures.notes == {"train_minutes": "train: 110% held from the stance was not reached"}
+        return
+    assert figures.values["train_msteps"] == pytest.approx(run.batch / 1e6)
+    assert 0 < figures.values["train_minutes"] < 1
 
 
 def test_a_share_of_the_time_is_a_share(tmp_path: Path) -> None:

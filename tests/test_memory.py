@@ -115,7 +115,7 @@ def test_a_world_on_engine_warp():
     for n in range(1, 8):
         sim.step(HOME.repeat(n, 1), torch.arange(n))
     made = sum(num_bytes(space._data) for space in sim._spaces.values())
-    made += sum(part.nbytes for part in (sim._rows, sim._own, sim._force))
+    made += sim._rows.nbytes + sim._own.nbytes
     assert sum(sim._spaces) == 14, "as many again as the simulator has"
     assert made == pytest.approx(7 * said, rel=0.02)
     assert sim.world_bytes == said

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,6 +120,22 @@ def test_the_same_seed_learns_the_same(tmp_path):
         ppo.train(runner, tmp_path / name)
         weights.append(runner.alg.actor.state_dict())
     assert all(torch.equal(value, weights[1][key]) for key, value in weights[0].items())
+
+
+def test_deterministic_is_asked_of_torch(tmp_path, monkeypatch):
+    """Which the engine follows; operations that have no such version only warn."""
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", "")
+    monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG")
+    args = ppo.Args("handstand", engine="mujoco", threads=1, out=tmp_path, set=("env.worlds=2",))
+    ppo.set_up(args, [])
+    assert not torch.are_deterministic_algorithms_enabled()
+    try:
+        ppo.set_up(replace(args, deterministic=True), [])
+        assert torch.are_deterministic_algorithms_enabled()
+        assert torch.is_deterministic_algorithms_warn_only_enabled()
+        assert os.environ["CUBLAS_WORKSPACE_CONFIG"] == ":4096:8"
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 def test_nothing_left_to_do(trained, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Self
 
@@ -17,6 +18,8 @@ from torch.utils._pytree import tree_leaves
 from hmc.go2.conditions import Conditions, NoiseCfg
 from hmc.go2.model import load_model
 from hmc.go2.task import CostCfg, FlipCfg, JumpCfg, flip_task
+from hmc.go2.variants import Variant
+from hmc.sim.cuda import Recorded
 from hmc.sim.ids import Ids
 from hmc.sim.warp import WarpSim
 from tests.tiny import CFG, make_env, make_legs, make_runner
@@ -164,18 +167,19 @@ def test_no_step_waits(kind, tmp_path):
 
 
 def test_no_call_of_engine_warp_waits():
-    """But for the graph itself, whose launch never does: rows go in and come out on the device, of worlds by
-    index, as a stretch and all of them, in workspaces of each size."""
+    """But for the graphs themselves, whose launch never does: of worlds by index, as a stretch, all of them
+    and by flags, in workspaces of each size."""
     sim: Any = WarpSim(load_model(), 6, device="cpu", latency=(0, 1, 2, 3, 4, 4))
     for n in (6, 3, 2):
         sim.step(sim.u(slice(0, n)), torch.arange(n))
+        sim.contact_forces(slice(0, n))
+    sim.reset_flagged(torch.zeros(6, dtype=torch.bool), sim.x(), sim.u())
     for thing in (sim, *sim._spaces.values()):
         for name, value in vars(thing).items():
             if isinstance(value, Tensor):
                 setattr(thing, name, value.to(META))
-            elif isinstance(value, dict) and all(isinstance(each, Tensor) for each in value.values()):
-                setattr(thing, name, {key: each.to(META) for key, each in value.items()})
-        thing.run = lambda: None
+            elif isinstance(value, Recorded):
+                setattr(thing, name, lambda: None)
     sim._device = META
     with Copies() as copies:
         for ids in (None, slice(0, 3), torch.zeros(2, dtype=torch.long, device=META)):
@@ -184,8 +188,42 @@ def test_no_call_of_engine_warp_waits():
             sim.step(u, ids)
             sim.load(sim.save(ids), ids)
             assert sim.actuator_force(ids).device == META
+            assert sim.contact_forces(ids).device == META
+        reset(sim, torch.zeros(6, dtype=torch.bool, device=META), sim.x(), sim.u())
     assert not copies.found
     assert len(sim._spaces) == 3
+
+
+class Starts(TorchDispatchMode):
+    """Counts what a GPU would start a kernel for: operations that are neither views nor make room."""
+
+    FREE = ("slice", "select", "view", "_unsafe_view", "expand", "unsqueeze", "alias", "detach", "empty")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.number = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.number += func.overloadpacket.__name__ not in self.FREE
+        return func(*args, **(kwargs or {}))
+
+
+def test_what_engine_warp_starts_beside_its_graphs():
+    """Which worlds, how many, and what they are given: whatever a world is made of, nobody copies that."""
+    models = [Variant(friction=0.5 + 0.1 * i).model() for i in range(4)]
+    sim = WarpSim(load_model(), 4, device="cpu", latency=(0, 1, 2, 3), models=models)
+    x, u, ids, flags = sim.x(), sim.u(), torch.tensor([2, 0]), torch.tensor([True, False, True, False])
+    calls: list[Callable[[], Any]] = [
+        lambda: sim.step(u),
+        lambda: sim.step(u[:2], ids),
+        lambda: sim.contact_forces(),
+        lambda: sim.reset_flagged(flags, x, u),
+    ]
+    for call in calls:
+        call()  # is recorded
+        with Starts() as starts:
+            call()
+        assert starts.number == 3
 
 
 @torch.no_grad()

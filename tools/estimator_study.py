@@ -6,14 +6,11 @@ same frames. The policies that make the motions see the true state: the loop is 
 
 from __future__ import annotations
 
-import csv
-import json
-import multiprocessing
 import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +22,33 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
-from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 
+from deploy.estimator import EstimatorCfg  # noqa: E402
 from hmc.cli import one_line_errors  # noqa: E402
+from tools import study  # noqa: E402
 from tools.estimators.chi2 import band  # noqa: E402
 from tools.estimators.figure import draw  # noqa: E402
-from tools.estimators.measure import FILTERS, NEES, Score, measure  # noqa: E402
+from tools.estimators.measure import FILTERS, NEES, Job, Score, measure  # noqa: E402
+from tools.estimators.sensors import SensorCfg  # noqa: E402
 from tools.estimators.simulate import MOTIONS  # noqa: E402
 
 
 @dataclass(frozen=True)
-class Args:
+class StudyCfg:
+    """What is compared.
+
+    Attributes:
+        estimator: settings of ours.
+        sensors: errors of the robots' sensors.
+    """
+
+    estimator: EstimatorCfg = field(default_factory=EstimatorCfg)
+    sensors: SensorCfg = field(default_factory=SensorCfg)
+
+
+@dataclass(frozen=True)
+class Args(study.Workers):
     """Command line.
 
     Attributes:
@@ -45,8 +57,7 @@ class Args:
         seconds: length of each log [s].
         motions: which.
         filters: which.
-        out: folder to write to.
-        processes: logs at the same time, a core each; 0 for as many as there are cores.
+        out: folder to write to; a study that was stopped goes on from what is there.
     """
 
     seeds: int = 50
@@ -55,33 +66,30 @@ class Args:
     motions: tuple[str, ...] = MOTIONS
     filters: tuple[str, ...] = FILTERS
     out: Path = ROOT / "out" / "estimator"
-    processes: int = 0
 
 
-def _work(motion: str, seconds: float, seed: int, filters: tuple[str, ...]) -> list[Score]:
+def jobs(args: Args) -> list[Job]:
+    """Every motion with every seed and filter."""
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    return [
+        Job(motion, args.seconds, seed, name)
+        for motion in args.motions
+        for seed in seeds
+        for name in args.filters
+    ]
+
+
+def work(cfg: StudyCfg, job: Job) -> Score:
+    """One job, in a process of its own."""
     torch.set_num_threads(1)
-    return measure(motion, seconds, seed, filters)
-
-
-def run_all(args: Args, console: Console) -> list[Score]:
-    """Every motion with every seed; in the order of the arguments whatever ends first."""
-    jobs = [(motion, args.seconds, seed) for motion in args.motions for seed in seeds(args)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.processes or os.cpu_count() or 1, mp_context=context) as pool:
-        order = {pool.submit(_work, *job, args.filters): i for i, job in enumerate(jobs)}
-        done: list[list[Score]] = [[] for _ in jobs]
-        for future in track(as_completed(order), "logs", total=len(jobs), console=console):
-            done[order[future]] = future.result()
-    return [score for scores in done for score in scores]
-
-
-def seeds(args: Args) -> range:
-    return range(args.first_seed, args.first_seed + args.seeds)
+    return measure(job, cfg.estimator, cfg.sensors)
 
 
 def summarise(scores: Sequence[Score], motion: str, name: str) -> dict[str, Any]:
     """Means over the seeds in which the robot did what it should; NEES with its 95 % band."""
-    rows = [score for score in scores if (score.motion, score.filter) == (motion, name) and score.kept]
+    rows = [
+        score for score in scores if (score.job.motion, score.job.filter) == (motion, name) and score.kept
+    ]
     row: dict[str, Any] = {"motion": motion, "filter": name, "seeds": len(rows)}
     if not rows:
         return row
@@ -95,8 +103,8 @@ def summarise(scores: Sequence[Score], motion: str, name: str) -> dict[str, Any]
         row["rejected"] = float(np.mean([score.rejected for score in rows]))
         row["falls"] = sum(score.falls for score in rows)
         row["used_slip"] = float(np.mean([score.used_slip for score in rows]))
-        for i, (part, freedom) in enumerate(NEES.items()):
-            row[f"nees_{part}"] = float(np.mean([score.nees[i] for score in rows]))
+        for part, freedom in NEES.items():
+            row[f"nees_{part}"] = float(np.mean([getattr(score, f"nees_{part}") for score in rows]))
             row[f"band_{part}"] = band(freedom, len(rows))
     return row
 
@@ -130,32 +138,23 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     return view
 
 
-def write(out: Path, scores: Sequence[Score], rows: Sequence[dict[str, Any]], args: Args) -> None:
-    """All scores as CSV, the summary as JSON."""
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "scores.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([field.name for field in fields(Score) if field.name != "nees"] + list(NEES))
-        for score in scores:
-            values = asdict(score)
-            nees = values.pop("nees")
-            writer.writerow([*values.values(), *nees])
-    settings = {"seeds": args.seeds, "first_seed": args.first_seed, "seconds": args.seconds}
-    text = json.dumps({"settings": settings, "rows": rows}, indent=2)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
-
-
 def main(args: Args) -> int:
-    """Run, print, write."""
+    """Run what is missing, print, write."""
     with one_line_errors():
         for name, known in ((args.motions, MOTIONS), (args.filters, FILTERS)):
             for item in name:
                 if item not in known:
                     raise ValueError(f"{item!r}: expected one of {', '.join(known)}")
+        cfg = StudyCfg()
+        scores_at = study.folder_of(args.out, cfg, args.resume) / "scores.csv"
     console = Console()
-    scores = run_all(args, console)
+    scores = study.carry_out(partial(work, cfg), jobs(args), scores_at, Score, args, console)
+    if scores is None:
+        return 1
     rows = [summarise(scores, motion, name) for motion in args.motions for name in args.filters]
-    write(args.out, scores, rows, args)
+    study.write(args.out / "scores.csv", scores)
+    settings = {"seeds": args.seeds, "first_seed": args.first_seed, "seconds": args.seconds}
+    study.write_json(args.out / "summary.json", {"settings": settings, "rows": rows})
     console.print(table(rows))
     draw(args.out / "estimator.png", args.seconds, args.first_seed)
     return 0

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from hmc.sim.base import Sim
+from hmc.sim.base import CanResetFlagged, Sim
 
 # indices of n worlds (n,) long, or flags of all W of them (W,) bool, where n is W below
 Chosen: TypeAlias = Tensor
@@ -40,6 +40,9 @@ def reset(sim: Sim, chosen: Chosen, x: Tensor, u: Tensor) -> None:
     """Put the chosen worlds at states x (n, nx) with last inputs u (n, nu)."""
     if chosen.dtype != torch.bool:
         sim.reset(x, u, chosen)
+        return
+    if isinstance(sim, CanResetFlagged):
+        sim.reset_flagged(chosen, x, u)
         return
     before = sim.save()
     sim.reset(x, u)

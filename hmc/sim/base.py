@@ -111,3 +111,12 @@ class CanRollOut(Protocol):
     def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
         """See the function of this name."""
         ...
+
+
+@runtime_checkable
+class CanResetFlagged(Protocol):
+    """An engine on whose device worlds begin anew without anybody knowing how many."""
+
+    def reset_flagged(self, flags: Tensor, x: Tensor, u: Tensor) -> None:
+        """`Sim.reset` of the worlds that are flagged, of flags (W,) bool, x (W, nx) and u (W, nu)."""
+        ...

@@ -44,23 +44,48 @@ def graphs(device: torch.device) -> tuple[bool, bool]:
     return captured, loops
 
 
-def capture(work: Callable[[], None], device: Any) -> Any:
-    """A graph of all that `work` launches on a device of Warp's, for `warp.capture_launch` on any stream.
+class Recorded:
+    """Work on a device of Warp's that is launched as one graph; kernel by kernel where it has no graphs.
 
-    `work` runs once before it is recorded, because its kernels are compiled and loaded then. What it makes
+    It runs once before it is recorded, because its kernels are compiled and loaded then. What it makes
     lives as long as the graph; arrays that it is to find again must not move.
+
+    Args:
+        work: what launches the kernels.
+        device: Warp's.
+        captured: whether graphs can be recorded there.
     """
-    work()
-    wp.synchronize_device(device)
-    collecting = gc.isenabled()
-    gc.disable()  # what it collects may free memory of the device, which is not allowed during a capture
-    try:
-        with wp.ScopedCapture(device) as captured:
-            work()
-    finally:
-        if collecting:
-            gc.enable()
-    return captured.graph
+
+    def __init__(self, work: Callable[[], None], device: Any, captured: bool):
+        self._work, self._device = work, device
+        self._where = wp.device_to_torch(device)
+        if device.is_cuda:  # Warp makes arrays and records on a stream of its own, torch's is another
+            torch.cuda.synchronize(self._where)
+        self.graph = self._capture() if captured else None
+        wp.synchronize_device(device)
+
+    def __call__(self) -> None:
+        """Do it on the stream that torch works on: nobody waits in between."""
+        cuda = self._device.is_cuda
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self._where)) if cuda else None
+        if self.graph is not None:
+            wp.capture_launch(self.graph, stream=stream)
+            return
+        with wp.ScopedStream(stream):
+            self._work()
+
+    def _capture(self) -> Any:
+        self._work()
+        wp.synchronize_device(self._device)
+        collecting = gc.isenabled()
+        gc.disable()  # what it collects may free memory of the device, which is not allowed during a capture
+        try:
+            with wp.ScopedCapture(self._device) as captured:
+                self._work()
+        finally:
+            if collecting:
+                gc.enable()
+        return captured.graph
 
 
 def check_memory(one: Any, worlds: int, device: torch.device) -> None:

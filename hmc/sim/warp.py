@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Sequence
-from itertools import accumulate
 from typing import Any
 
 import mujoco
@@ -14,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from hmc.sim.check import check, check_latency
-from hmc.sim.cuda import capture, check_memory, graphs, num_bytes
+from hmc.sim.cuda import Recorded, check_memory, graphs, num_bytes
 from hmc.sim.device import find_device
 from hmc.sim.ids import Ids, count, fresh, where
 from hmc.sim.variety import own_values
@@ -23,8 +22,7 @@ wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # not one line a
 
 import mujoco_warp as mjw  # noqa: E402
 
-# What decides how a world goes on, in the order of a snapshot row.
-FIELDS = ("time", "qpos", "qvel", "act", "history", "plastic", "qacc_warmstart", "ctrl")
+from hmc.sim.workspace import FIELDS, LOSSES, Workspace, fields, slices  # noqa: E402
 
 # Most contacts that one pair of geoms can make; any pair that is not listed makes at most 8.
 PLANE, SPHERE, CAPSULE, BOX = (
@@ -41,28 +39,21 @@ PAIR_CONTACTS = {
 }
 MAX_CONTACTS = 128  # a world; more than that is sized by hand
 
-# Overflows that drop contacts or constraints; a solver at its iteration limit drops nothing, nor do sensors.
-_FLAGS = mjw.OverflowType
-LOSSES = {
-    "constraints": _FLAGS.NEFC | _FLAGS.NJMAX_NNZ | _FLAGS.NVMAX,
-    "contacts": _FLAGS.BROADPHASE | _FLAGS.NARROWPHASE | _FLAGS.CCD | _FLAGS.HFIELD | _FLAGS.EPA_HORIZON,
-}
-
 
 @wp.kernel
-def arrive(now: int, late: wp.array[float], inputs: wp.array2d[float], ctrl: wp.array2d[float]) -> None:
-    """Let the inputs act whose latency is over by physics step `now`."""
+def begin(flags: wp.array[bool], start: wp.array2d[float], rows: wp.array2d[float]) -> None:
+    """Put the worlds that are flagged at their start."""
     world, i = wp.tid()  # type: ignore[misc]
-    if late[world] <= float(now):
-        ctrl[world, i] = inputs[world, i]  # type: ignore[index]
+    if flags[world]:
+        rows[world, i] = start[world, i]  # type: ignore[index]
 
 
 class WarpSim:
     """W worlds of a MuJoCo model on `mujoco_warp`; see `hmc.sim.base.Sim`.
 
     x is qpos then qvel, u is ctrl, all float32 on `device`. Worlds live as rows of one torch tensor, so
-    that save, load and reset are indexing on the device. A step copies the rows it is about into a
-    workspace, runs the substeps there (one captured graph) and copies them back; 70 floats a
+    that save, load and reset are indexing on the device. A step is one captured graph that copies the rows
+    it is about into a workspace, runs the substeps there and copies them back; 82 floats a
     world for the Go2, against some 30,000 that a substep touches. A step of n of the W worlds uses the
     smallest workspace that holds n, one of W, W/2, W/4, ... worlds (made at first use), so that it costs
     at most twice the step of n worlds, and all workspaces together at most twice the memory.
@@ -145,14 +136,19 @@ class WarpSim:
         columns = [torch.tensor(late)[:, None], *map(torch.from_numpy, own.values())]
         self._own = torch.cat([values.flatten(1).float() for values in columns], 1).to(self._device)
         self._arrivals = sorted({0, *late} - {substeps})  # physics steps that inputs come at
-        self._spaces: dict[int, Workspace] = {}
-        self._each = 0  # bytes of the engine's arrays of a world
-        first = self._space(num_worlds)
-        self._slices = first.slices
-        self._fresh = first.read()[0]
+        self._one = self._data(1)  # a world's arrays, to see what so many take
+        check_memory(self._one, num_worlds, self._device)
+        wp.synchronize_device(self._on_warp)  # filled on a stream of Warp's, read on torch's
+        first = fields(self._one, FIELDS)
+        self._slices = slices({name: field.shape[1] for name, field in first.items()})
+        self._moving = slice(self._slices["qpos"].start, self._slices["qvel"].stop)
+        self._fresh = torch.cat([wp.to_torch(field) for field in first.values()], 1)
         self._rows = self._fresh.repeat(num_worlds, 1)
-        self._force = torch.zeros(num_worlds, model.nu, device=self._device)
         self._lost = torch.zeros(len(LOSSES), dtype=torch.long, device=self._device)
+        self._all = torch.arange(num_worlds, device=self._device)
+        self._begin: Recorded | None = None
+        self._spaces: dict[int, Workspace] = {}
+        self._space(num_worlds)
 
     @property
     def num_worlds(self) -> int:
@@ -161,7 +157,7 @@ class WarpSim:
     @property
     def world_bytes(self) -> int:
         """What a world takes on the device when all workspaces are made."""
-        return 2 * self._each + sum(part[0].nbytes for part in (self._rows, self._own, self._force))
+        return 2 * num_bytes(self._one) + self._rows[0].nbytes + self._own[0].nbytes
 
     @property
     def nx(self) -> int:
@@ -184,19 +180,34 @@ class WarpSim:
         return torch.float32
 
     def x(self, ids: Ids = None) -> Tensor:
-        columns = self._rows[:, self._slices["qpos"].start : self._slices["qvel"].stop]
-        return fresh(columns, ids)
+        return fresh(self._rows[:, self._moving], ids)
 
     def u(self, ids: Ids = None) -> Tensor:
-        columns = self._rows[:, self._slices["ctrl"]]
-        return fresh(columns, ids)
+        return fresh(self._rows[:, self._slices["ctrl"]], ids)
 
     def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         check(self._num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
-        row = self._fresh.repeat(len(x), 1)
-        row[:, self._slices["qpos"].start : self._slices["qvel"].stop] = x.to(row)
-        row[:, self._slices["ctrl"]] = u.to(row)
-        self.load(row, ids)
+        rows = self._fresh.repeat(len(x), 1)
+        self._begin_at(rows, x, u)
+        self.load(rows, ids)
+
+    def reset_flagged(self, flags: Tensor, x: Tensor, u: Tensor) -> None:
+        """Put the worlds that are flagged, of flags (W,) bool, at their states of x (W, nx) with last inputs
+        u (W, nu), as `reset` does; the others go on. One graph, however many they are."""
+        check(self._num_worlds, None, x=(x, self.nx), u=(u, self.nu))
+        if self._begin is None:
+            self._flags = torch.zeros(self._num_worlds, dtype=torch.bool, device=self._device)
+            self._start = self._fresh.repeat(self._num_worlds, 1)
+            arrays = [wp.from_torch(each) for each in (self._flags, self._start, self._rows)]
+            shape = tuple(self._rows.shape)
+            self._begin = Recorded(
+                lambda: wp.launch(begin, shape, inputs=arrays, device=self._on_warp),
+                self._on_warp,
+                self._captured,
+            )
+        self._flags.copy_(flags)
+        self._begin_at(self._start, x, u)
+        self._begin()
 
     def save(self, ids: Ids = None) -> Tensor:
         return fresh(self._rows, ids)
@@ -207,25 +218,25 @@ class WarpSim:
 
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self._num_worlds, ids, u=(u, self.nu))
-        n = count(ids, self._num_worlds)
-        if n == 0:
-            return
-        ids = where(ids)
-        space = self._space(self._size(n))
-        space.write(fresh(self._rows, ids), fresh(self._own, ids), u)
-        space.run()
-        row = space.read()[:n]
-        row[:, self._slices["ctrl"]] = u.to(row)  # also where it comes only with the next step
-        lost = torch.stack([space.overflow[:n] & int(bits) != 0 for bits in LOSSES.values()])
-        self._lost += lost.sum(1)
-        moving = slice(self._slices["qpos"].start, self._slices["qvel"].stop)
-        row[:, moving] = row[:, moving].masked_fill(lost.any(0)[:, None], torch.nan)
-        self._rows[ids] = row
-        self._force[ids] = space.force[:n]
+        if len(u) > 0:
+            self._space(self._size(len(u))).step(self._worlds(ids), u)
 
     def actuator_force(self, ids: Ids = None) -> Tensor:
-        """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees."""
-        return fresh(self._force, ids)
+        """Joint torque in the last substep [N m], (n, nu): what a motor's current sensor sees; 0 after a
+        reset, its parent's in a branch."""
+        return fresh(self._rows[:, self._slices["actuator_force"]], ids)
+
+    def contact_forces(self, ids: Ids = None) -> Tensor:
+        """Net force of all contacts on each geom [N], (n, ngeom, 3), in world axes.
+
+        Of the worlds as they are, with their last input: right after a reset or a load, too. It takes a
+        forward pass, a graph of its own, that changes nothing of a world. NaN where contacts or constraints
+        do not fit, which `overflow` counts.
+        """
+        n = count(ids, self._num_worlds)
+        if n == 0:
+            return torch.zeros(0, self.model.ngeom, 3, device=self._device)
+        return self._space(self._size(n)).contact_forces(self._worlds(ids))
 
     def overflow(self) -> dict[str, int]:
         """World-steps spoiled since the last call because contacts or constraints did not fit.
@@ -245,105 +256,37 @@ class WarpSim:
             size = (size + 1) // 2
         return size
 
+    def _worlds(self, ids: Ids) -> Tensor:
+        """Their indices, (n,)."""
+        return ids if isinstance(ids, Tensor) else self._all[where(ids)]
+
+    def _begin_at(self, rows: Tensor, x: Tensor, u: Tensor) -> None:
+        """Write states and inputs into fresh rows."""
+        rows[:, self._moving] = x.to(rows)
+        rows[:, self._slices["ctrl"]] = u.to(rows)
+
+    def _data(self, size: int) -> Any:
+        """Arrays of so many worlds."""
+        with wp.ScopedDevice(self._on_warp):
+            return mjw.make_data(self.model, nworld=size, nconmax=self.contacts, njmax=self.constraints)
+
     def _space(self, size: int) -> Workspace:
         if size not in self._spaces:
+            check_memory(self._one, size, self._device)
             with wp.ScopedDevice(self._on_warp):
-                room = {"nconmax": self.contacts, "njmax": self.constraints}
-                one = mjw.make_data(self.model, nworld=1, **room)
-                self._each = num_bytes(one)
-                check_memory(one, size, self._device)
-                data = mjw.make_data(self.model, nworld=size, **room)
                 params = with_fields(self._params, self._varied, size)
             self._spaces[size] = Workspace(
-                params, data, self._on_warp, self._substeps, self._varied, self._arrivals, self._captured
+                params,
+                self._data(size),
+                rows=self._rows,
+                own=self._own,
+                varied=self._varied,
+                substeps=self._substeps,
+                arrivals=self._arrivals,
+                lost=self._lost,
+                captured=self._captured,
             )
         return self._spaces[size]
-
-
-class Workspace:
-    """A batch of worlds on the device that rows are copied into, stepped in, and copied out of."""
-
-    def __init__(
-        self,
-        params: Any,
-        data: Any,
-        device: Any,
-        substeps: int,
-        varied: Sequence[str],
-        arrivals: Sequence[int],
-        captured: bool,
-    ):
-        self._params, self._data, self._device = params, data, device
-        self._substeps, self._arrivals, self._captured = substeps, arrivals, captured
-        size = data.nworld
-        self._views = {name: wp.to_torch(getattr(data, name)).view(size, -1) for name in FIELDS}
-        self.slices = slices(self._views)
-        with wp.ScopedDevice(device):
-            self._late, self._inputs = wp.zeros(size, dtype=float), wp.zeros_like(data.ctrl)
-        # as in a row of what a world has of its own
-        self._own = {"late": wp.to_torch(self._late)[:, None]}
-        for name in varied:
-            self._own[name] = wp.to_torch(getattr(params, name)).view(size, -1)
-        self._own_slices = slices(self._own)
-        self._u = wp.to_torch(self._inputs)
-        self.force = wp.to_torch(data.actuator_force)
-        self.overflow = wp.to_torch(data.overflow)
-        self._graph: Any = None
-        wp.synchronize_device(device)  # Warp filled these on a stream of its own, torch writes on another
-
-    def write(self, rows: Tensor, own: Tensor, u: Tensor) -> None:
-        """Take rows (n, ns), what their worlds have of their own (n, no), and inputs (n, nu).
-
-        The worlds beyond n copy the first, which costs less than strays would.
-        """
-        for view, given in (
-            *((view, rows[:, self.slices[name]]) for name, view in self._views.items()),
-            *((view, own[:, self._own_slices[name]]) for name, view in self._own.items()),
-            (self._u, u),
-        ):
-            view[: len(given)] = given
-            view[len(given) :] = given[:1]
-        self.overflow.zero_()
-
-    def read(self) -> Tensor:
-        """Rows of all worlds, (size, ns)."""
-        return torch.cat(list(self._views.values()), dim=1)
-
-    def run(self) -> None:
-        """One control step, on the stream that torch works on: nobody waits in between."""
-        cuda = self._device.is_cuda
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.force.device)) if cuda else None
-        if not self._captured:
-            with wp.ScopedStream(stream):
-                self._substep_all()
-            return
-        if self._graph is None:
-            self._capture()
-        wp.capture_launch(self._graph, stream=stream)
-
-    def _substep_all(self) -> None:
-        with wp.ScopedDevice(self._device):
-            for i in range(self._substeps):
-                if i in self._arrivals:
-                    ctrl = self._data.ctrl
-                    wp.launch(arrive, ctrl.shape, inputs=[i, self._late, self._inputs, ctrl])
-                mjw.step(self._params, self._data)
-
-    def _capture(self) -> None:
-        """Record the substeps once; the state they start from is put back."""
-        rows = self.read()
-        if self._device.is_cuda:
-            torch.cuda.synchronize(rows.device)  # Warp records on a stream of its own
-        self._graph = capture(self._substep_all, self._device)
-        for name, view in self._views.items():
-            view[:] = rows[:, self.slices[name]]
-        self.overflow.zero_()
-
-
-def slices(views: dict[str, Tensor]) -> dict[str, slice]:
-    """Where the columns of each are when they lie side by side."""
-    ends = list(accumulate(view.shape[1] for view in views.values()))
-    return {name: slice(begin, end) for name, begin, end in zip(views, [0, *ends], ends, strict=False)}
 
 
 def with_fields(params: Any, names: Sequence[str], worlds: int) -> Any:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -22,15 +23,17 @@ from hmc.go2.model import HOME, Q_LOWER, Q_UPPER, SUBSTEPS, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, jump_mode, policy_path
 from hmc.memory import make_worlds
-from hmc.sim.cuda import capture, graphs, num_bytes
+from hmc.sim.cuda import Recorded, graphs, num_bytes
 from hmc.sim.device import devices, find_device, free_memory
 from hmc.sim.make import make_sim
 from hmc.sim.warp import WarpSim
-from tools import closed_loop
+from tools import closed_loop, curves
+from tools.benchmarks import learning
 from tools.benchmarks.engine import add_ratio, same, take_turns
 from tools.benchmarks.figures import Common, Figures, cores
 from tools.benchmarks.train import Train, iterations
-from train.config import ROOT, read_training
+from train.config import ROOT, TrainCfg, read_training
+from train.env import Go2Env
 from train.make import make_env
 
 # without a GPU: so little that Warp's CPU device gets through it
@@ -43,6 +46,7 @@ TINY: dict[str, Any] = {
     "samples": 4,
     "plan_steps": 6,
     "iterations": 1,
+    "level": 0.0,
     "set": ("ppo.steps=4", "ppo.hidden=[16]", "ppo.minibatches=2"),
 }
 
@@ -61,6 +65,9 @@ class Gpu(Common):
         samples: of the MPPI update.
         plan_steps: its horizon [control steps].
         iterations: of training that count, after one that does not.
+        level: share of episodes from the stance that hold, up to which the handstand is trained then.
+        out: folder for these runs and the picture of their learning curves.
+        cpu: folder of the same training on a CPU, to be told of and drawn beside them; None for none.
         set: overrides of cfg/handstand.toml.
     """
 
@@ -73,6 +80,9 @@ class Gpu(Common):
     samples: int = 4096
     plan_steps: int = 40
     iterations: int = 5
+    level: float = 0.9
+    out: Path = ROOT / "out" / "gpu"
+    cpu: Path | None = None
     set: tuple[str, ...] = ()
 
 
@@ -92,9 +102,14 @@ def gpu(args: Gpu) -> Figures:
         figures.notes["gpu"] = (
             f"on {torch.cuda.get_device_name()}, CUDA driver {wp.get_cuda_driver_version()}"
         )
+    runs = [] if args.cpu is None else [curves.read(args.cpu)]
+    for run in runs:
+        learning.tell(figures, "train_cpu", run, args.level)
     for worlds in args.worlds:
         _stepping(figures, args, device, worlds)
         _training(figures, args, device, worlds)
+        runs.append(_learning(figures, args, device, worlds))
+    curves.draw(runs, args.out / "learning.png")
     _planning(figures, args, device)
     return figures
 
@@ -108,6 +123,8 @@ def listed(args: Gpu) -> dict[str, str]:
         found[f"step_{worlds}_efficiency"] = "the simulator's rate over that"
         found[f"env_{worlds}_efficiency"] = "the environment's rate over that"
         found[f"train_{worlds}_steps_per_s"] = "environment steps/s, learning included"
+        found[f"train_{worlds}_gib"] = "device memory that training takes, all included [GiB]"
+        found[f"train_{worlds}_minutes"] = f"training until {args.level:.0%} hold from the stance [min]"
         found[f"memory_{worlds}_kb"] = "device memory a world, all included [KiB]"
     found[f"{search}_ms"] = "the single-switch problem solved exactly [ms]"
     found[f"{search}_candidates_per_s"] = "schedules a second"
@@ -138,7 +155,7 @@ class Bare:
         self.qpos, self.qvel = wp.to_torch(self.data.qpos), wp.to_torch(self.data.qvel)
         self.ctrl = wp.to_torch(self.data.ctrl)
         captured, self.model.opt.graph_conditional = graphs(sim.device)
-        self.graph = capture(self._substeps, self.device) if captured else None
+        self.substeps = Recorded(self._substeps, self.device, captured)
 
     def reset(self, x: Tensor) -> None:
         """Begin at states (W, nx)."""
@@ -150,12 +167,7 @@ class Bare:
     def step(self, u: Tensor) -> None:
         """One control step."""
         self.ctrl[:] = u
-        stream = wp.stream_from_torch(torch.cuda.current_stream(u.device)) if u.is_cuda else None
-        if self.graph is not None:
-            wp.capture_launch(self.graph, stream=stream)
-            return
-        with wp.ScopedStream(stream):
-            self._substeps()
+        self.substeps()
 
     def _substeps(self) -> None:
         with wp.ScopedDevice(self.device):
@@ -223,8 +235,7 @@ def _stepping(figures: Figures, args: Gpu, device: str, worlds: int) -> None:
     add_ratio(figures, f"step_{worlds}", times, physics, f"{worlds:,} worlds, given targets")
     figures.add(f"arrays_{worlds}_kb", num_bytes(alone.data) / worlds / 1024, "arrays of a world [KiB]")
 
-    cfg = read_training("handstand", "handstand", (*args.set, f"env.worlds={worlds}"))
-    env = make_env(cfg.env, "warp", device=device)
+    _, env = _handstand(args, device, worlds)
 
     def environment() -> Iterator[None]:
         for _ in targets:
@@ -238,12 +249,34 @@ def _stepping(figures: Figures, args: Gpu, device: str, worlds: int) -> None:
 
 def _training(figures: Figures, args: Gpu, device: str, worlds: int) -> None:
     """PPO, learning included."""
-    cfg = read_training("handstand", "handstand", (*args.set, f"env.worlds={worlds}"))
-    env = make_env(cfg.env, "warp", device=device)
+    gc.collect()
+    there = find_device(device)
+    free = free_memory(there)
+    cfg, env = _handstand(args, device, worlds)
     with torch.enable_grad():
         whole, *_ = iterations(Train(warm_up=1, iterations=args.iterations), cfg, env)
+    if device != "cpu":  # what torch keeps to itself included: it was in use
+        used = free - torch.cuda.mem_get_info(there)[0]
+        figures.add(f"train_{worlds}_gib", used / 2**30, "device memory that training takes [GiB]")
     rate = worlds * cfg.ppo.steps / float(whole.mean())
     figures.add(f"train_{worlds}_steps_per_s", rate, "environment steps/s, learning included")
+
+
+def _learning(figures: Figures, args: Gpu, device: str, worlds: int) -> curves.Curves:
+    """The same training from its beginning up to its success."""
+    gc.collect()
+    cfg, env = _handstand(args, device, worlds)
+    argv = ["--mode", "handstand", "--engine", "warp", "--set", *args.set, f"env.worlds={worlds}"]
+    with torch.enable_grad():
+        run = learning.train_until(args.level, cfg, env, args.out / f"train_{worlds}", argv)
+    learning.tell(figures, f"train_{worlds}", run, args.level)
+    return replace(run, title=f"{run.title}, {worlds:,} worlds")
+
+
+def _handstand(args: Gpu, device: str, worlds: int) -> tuple[TrainCfg, Go2Env]:
+    """Its training in so many worlds of engine warp."""
+    cfg = read_training("handstand", "handstand", (*args.set, f"env.worlds={worlds}"))
+    return cfg, make_env(cfg.env, "warp", device=device)
 
 
 def _planning(figures: Figures, args: Gpu, device: str) -> None:

@@ -25,32 +25,50 @@ _EVERY = 10  # ticks between the samples of NEES
 
 
 @dataclass(frozen=True)
-class Score:
+class Job:
     """One filter on one log.
 
     Attributes:
-        motion, seed, filter: which.
+        motion: of the robot.
+        seconds: length of the log [s].
+        seed: of the robot.
+        filter: one of FILTERS.
+    """
+
+    motion: str
+    seconds: float
+    seed: int
+    filter: str
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well it did.
+
+    Attributes:
+        job: what was measured.
         kept: whether the robot did what it should.
         velocity: RMSE of the base velocity in the body frame [m/s].
         tilt: RMSE of the gravity direction [deg].
         height: error of the base height at the end [m].
         worst: largest velocity error [m/s].
-        nees: mean over the log, of `NEES`; empty for the references.
+        nees_velocity, nees_gravity, nees_biases: means over the log, of `NEES`; NaN for the references, like
+            the next two.
         rejected: share of updates with a foot that carries and does not slip that were not made.
         used_slip: share of feet that slip by more than 0.2 m/s under load and were used all the same.
         us: median time of a tick [us].
         falls: how often the estimator began anew; 0 for the references.
     """
 
-    motion: str
-    seed: int
-    filter: str
+    job: Job
     kept: bool
     velocity: float
     tilt: float
     height: float
     worst: float
-    nees: tuple[float, ...]
+    nees_velocity: float
+    nees_gravity: float
+    nees_biases: float
     rejected: float
     used_slip: float
     us: float
@@ -117,51 +135,41 @@ def gates(estimates: list[Estimate | None], log: Log, readings: Readings) -> tup
     return refused / max(good, 1), missed / max(slips, 1)
 
 
-def measure(
-    motion: str,
-    seconds: float,
-    seed: int,
-    filters: tuple[str, ...] = FILTERS,
-    cfg: EstimatorCfg | None = None,
-) -> list[Score]:
-    """Simulate one robot and run the filters on what its sensors say."""
-    log = simulate(motion, seconds, seed)
-    readings = sense(log, seed, SensorCfg())
-    true, scores = truth(log, readings.row), []
-    late = log.t[readings.row] >= SETTLE
+def measure(job: Job, cfg: EstimatorCfg, sensors: SensorCfg) -> Score:
+    """Simulate one robot and run the filter on what its sensors say."""
+    log = simulate(job.motion, job.seconds, job.seed)
+    readings = sense(log, job.seed, sensors)
+    true = truth(log, readings.row)
     references: dict[str, Callable[[], Reference]] = {"cheetah": Cheetah, "invariant": Invariant}
-    for name in filters:
-        nees: tuple[float, ...] = ()
-        rejected, used_slip, falls = np.nan, np.nan, 0
+    velocity = gravity = biases = np.nan
+    rejected, used_slip, falls = np.nan, np.nan, 0
+    if job.filter in references:
         began = time.perf_counter()
-        if name in references:
-            out = run(references[name](), readings)
-            us = (time.perf_counter() - began) / len(out)
-        else:
-            estimator = Estimator(cfg)
-            estimates, took = play(readings, estimator=estimator)
-            falls = estimator.falls
-            out, us = outputs(estimates), float(np.median(took))
-            nees = consistency(estimates, log, readings)
-            rejected, used_slip = gates(estimates, log, readings)
-        known = late & np.isfinite(out[:, 0])  # a robot that sways at the start is waited for
-        error = np.linalg.norm(out[known, :3] - true[known, :3], axis=1)
-        cosine = np.clip((out[known, 3:6] * true[known, 3:6]).sum(1), -1.0, 1.0)
-        scores.append(
-            Score(
-                motion,
-                seed,
-                name,
-                log.kept,
-                float(np.sqrt(np.mean(error**2))),
-                float(np.degrees(np.sqrt(np.mean(np.arccos(cosine) ** 2)))),
-                float(abs(out[-1, 6] - true[-1, 6])),
-                float(error.max()),
-                nees,
-                rejected,
-                used_slip,
-                1e6 * us,
-                falls,
-            )
-        )
-    return scores
+        out = run(references[job.filter](), readings)
+        us = (time.perf_counter() - began) / len(out)
+    else:
+        estimator = Estimator(cfg)
+        estimates, took = play(readings, estimator=estimator)
+        falls = estimator.falls
+        out, us = outputs(estimates), float(np.median(took))
+        velocity, gravity, biases = consistency(estimates, log, readings)
+        rejected, used_slip = gates(estimates, log, readings)
+    # a robot that sways at the start is waited for
+    known = (log.t[readings.row] >= SETTLE) & np.isfinite(out[:, 0])
+    error = np.linalg.norm(out[known, :3] - true[known, :3], axis=1)
+    cosine = np.clip((out[known, 3:6] * true[known, 3:6]).sum(1), -1.0, 1.0)
+    return Score(
+        job,
+        bool(log.kept),
+        float(np.sqrt(np.mean(error**2))),
+        float(np.degrees(np.sqrt(np.mean(np.arccos(cosine) ** 2)))),
+        float(abs(out[-1, 6] - true[-1, 6])),
+        float(error.max()),
+        velocity,
+        gravity,
+        biases,
+        rejected,
+        used_slip,
+        1e6 * us,
+        falls,
+    )
