@@ -26,7 +26,8 @@ class Cost:
         nonnegative: whether every term is >= 0 everywhere, which lets the planner stop a rollout as
             soon as its partial cost exceeds the best one known.
         on_cpu: the stage terms in order of `stage`, (n, number of stage terms), in one call: the same numbers
-            to the bit in less time, from float64 on the CPU; None: they are asked for one after the other.
+            to the bit in less time, from float64 on the CPU, without derivatives; None: they are asked for
+            one after the other.
     """
 
     stage: Mapping[str, StageFn]
