@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -121,7 +121,8 @@ class _Problem:
     LENGTHS = 0.6 ** torch.arange(14, dtype=torch.float64)
 
     def __init__(self, step: StepFn, cost: Cost, dt: float, k: int, lower: Tensor, upper: Tensor):
-        self.step, self.cost, self.dt, self.k = step, cost, dt, k
+        # what works on arrays cannot be differentiated
+        self.step, self.cost, self.dt, self.k = step, replace(cost, on_cpu=None), dt, k
         self.lower, self.upper = lower, upper
 
     def roll(self, x: Tensor, controls: Tensor) -> _Trajectory:

@@ -375,11 +375,11 @@ class SamplingMpc(Mode):
         sim.reset(x, u, ids)
         its = self._constants(x)
         controls = (its.spline @ theta).clamp(its.lower, its.upper)
-        states = torch.cat([x[:, None], rollout(sim, controls, ids)], 1)
-        before = torch.cat([u[:, None], controls[:, :-1]], 1)
-        steps = k[:, None] + torch.arange(horizon, device=k.device)
-        rows = states[:, :-1].reshape(n * horizon, -1), controls.reshape(n * horizon, -1)
-        terms = self.cost.stage_terms(*rows, before.reshape(n * horizon, -1), steps.reshape(-1))
+        states = rollout(sim, controls, ids)
+        begin = torch.cat([x[:, None], states[:, :-1]], 1).reshape(n * horizon, -1)
+        before = torch.cat([u[:, None], controls[:, :-1]], 1).reshape(n * horizon, -1)
+        steps = (k[:, None] + torch.arange(horizon, device=k.device)).reshape(-1)
+        terms = self.cost.stage_terms(begin, controls.reshape(n * horizon, -1), before, steps)
         self.control_steps += n * horizon
         stages = total((total(terms) * sim.dt).reshape(n, horizon))  # in this order at any n
         return stages + total(self.cost.terminal_terms(states[:, -1], k + horizon))

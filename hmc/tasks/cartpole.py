@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,10 +73,29 @@ def cartpole(cfg: CartpoleCfg | None = None) -> Task:
             },
             terminal={"final angle": lambda x, k: cfg.weight_final * (x[:, 0].cos() - 1).square()},
             nonnegative=True,
+            on_cpu=partial(_in_numpy, cfg),
         ),
         horizon=cfg.horizon,
         make_sim=lambda n: CartpoleSim(n, cfg.params, dt=cfg.dt, substeps=cfg.substeps),
     )
+
+
+def _in_numpy(cfg: CartpoleCfg, x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
+    """The stage terms of `cartpole`, (n, 4): the same to the bit, in place."""
+    terms = torch.empty(4, len(x), dtype=x.dtype)
+    angle, position, velocity, effort = terms.numpy()
+    theta, p, theta_dot, p_dot = x.numpy().T
+    torch.cos(torch.from_numpy(theta), out=terms[0])
+    angle -= 1
+    for rates, term in ((angle, angle), (p, position), (theta_dot, velocity), (p_dot, effort)):
+        np.multiply(rates, rates, out=term)
+    velocity += effort
+    force = u[:, 0].numpy()
+    np.multiply(force, force, out=effort)
+    weights = cfg.weight_angle, cfg.weight_position, cfg.weight_velocity, cfg.weight_input
+    for term, weight in zip((angle, position, velocity, effort), weights, strict=True):
+        term *= weight
+    return terms.T
 
 
 def initial_state(cfg: CartpoleCfg | None = None) -> Tensor:
