@@ -124,7 +124,9 @@ def set_up(args: Args, argv: Sequence[str] | None = None) -> Runner:
         runner.resume(str(checkpoint))
     runner.last_iteration = args.iterations or cfg.ppo.iterations
     runner.anneal = cfg.ppo.anneal
+    runner.final_std, runner.settle = cfg.ppo.final_std, cfg.ppo.settle
     runner.set_learning_rate(runner.current_learning_iteration)
+    runner.set_noise(runner.current_learning_iteration)
     return runner
 
 
