@@ -140,7 +140,7 @@ def train(runner: Runner, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with runner.table.live or contextlib.nullcontext():
         try:
-            runner.learn(runner.last_iteration - first, init_at_random_ep_len=first == 0)
+            runner.learn(runner.last_iteration - first, init_at_random_ep_len=True)
         except KeyboardInterrupt:
             done = runner.save_interrupted()
             note = f"go on with --resume (checkpoint in {folder})" if done else "nothing was learned yet"
