@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -43,17 +43,17 @@ def terms(x=REST, u=None, velocity=(0, 0, 0), command=(0, 0, 0), landed=(0, 0, 0
     u = x[:, 7:19] if u is None else u
     row = lambda values: torch.tensor([values], dtype=torch.float64)  # noqa: E731
     found = legs_rewards(
-        ONES, x, x, u, u, row(velocity), row(command), row(landed), go2.DT, go2.clearances(x)
+        ONES, x, x, u, u, row(velocity), row(command), row(landed), 0 * u, go2.DT, go2.clearances(x)
     )
     return {name: float(value[0]) for name, value in found.items()}
 
 
 def test_standing_still_earns_all_and_costs_nothing():
     found = terms()
-    earned = {"upright": 1, "height": 1, "posture": 1, "stillness": 1, "track": 1, "turn": 1}
+    earned = dict.fromkeys(("upright", "height", "posture", "stillness", "track", "turn"), 1)
     costs = {name: 0.0 for name in found if name not in earned}
     assert found == pytest.approx(earned | costs, abs=1e-9)
-    assert set(found) == {field.name for field in fields(LegsRewardCfg)} - {"termination"}
+    assert set(found) == {field.name for field in fields(LegsRewardCfg)} - {"termination", "width"}
 
 
 def test_on_its_back_nothing_is_earned():
@@ -63,6 +63,15 @@ def test_on_its_back_nothing_is_earned():
     assert found["touch"] <= -1.0
 
 
+def test_posture_earns_by_the_distance_from_the_pose():
+    x = REST.clone()
+    x[:, 7], x[:, 12] = 0.6, go2.HOME[5] + 0.8  # 1 rad^2
+    for width, worth in ((1.0, math.exp(-1.0)), (10.0, math.exp(-0.1))):
+        cfg, none, u = replace(ONES, width=width), torch.zeros(1, 3), x[:, 7:19]
+        found = legs_rewards(cfg, x, x, u, u, none, none, none, 0 * u, go2.DT, go2.clearances(x))
+        assert float(found["posture"]) == pytest.approx(worth)
+
+
 def test_walking_earns_by_what_was_commanded():
     told = (0.6, 0.0, 0.5)
     assert terms(velocity=told, command=told)["track"] == pytest.approx(1.0)
@@ -70,6 +79,15 @@ def test_walking_earns_by_what_was_commanded():
     assert slow["track"] == pytest.approx(math.exp(-(0.5**2) / 0.15))
     assert slow["turn"] == pytest.approx(math.exp(-(0.5**2) / 0.25))
     assert slow["stillness"] == 0.0, "told to walk, it earns nothing by standing"
+
+
+def test_targets_out_of_reach_cost_what_they_are_beyond():
+    env = make_legs("getup", rewards=LegsRewardCfg(beyond=2.0))
+    actions = torch.zeros(8, 12)
+    actions[1, 0], actions[2, 5], actions[3, 0] = 4.0, 2.5, 2.0  # beyond: 2 - 1.0472, 1.25 - 0.96224, nothing
+    _, _, _, extras = env.step(actions)
+    out = (2.0 - 1.0472) ** 2 + (1.25 - (1.8 - 0.83776)) ** 2
+    assert float(extras["log"]["/reward/beyond"]) == pytest.approx(-2.0 * out / 8, rel=1e-4)
 
 
 @pytest.mark.parametrize(("time", "worth"), [(0.05, 0.0), (0.15, 0.05), (0.25, 0.15), (2.0, 0.25)])
@@ -308,6 +326,6 @@ def test_a_trot_is_one_diagonal_pair():
         torch.zeros(5, 4),
     )
     u = x[:, 7:19]
-    found = legs_rewards(ONES, x, x, u, u, told, told, none, go2.DT, gap)["trot"]
+    found = legs_rewards(ONES, x, x, u, u, told, told, none, 0 * u, go2.DT, gap)["trot"]
     assert found.tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
-    assert not legs_rewards(ONES, x, x, u, u, 0 * told, 0 * told, none, go2.DT, gap)["trot"].any()
+    assert not legs_rewards(ONES, x, x, u, u, 0 * told, 0 * told, none, 0 * u, go2.DT, gap)["trot"].any()

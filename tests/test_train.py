@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import re
@@ -58,6 +59,21 @@ def test_the_learning_rate_falls_at_the_end(tmp_path):
         runner.set_learning_rate(iteration)
         assert runner.alg.learning_rate == pytest.approx(share * full)
         assert [g["lr"] for g in runner.alg.optimizer.param_groups] == [runner.alg.learning_rate]
+
+
+def test_the_noise_falls_or_is_learned(tmp_path):
+    cfg = replace(CFG, ppo=replace(CFG.ppo, init_std=0.8, final_std=0.1))
+    runner = make_runner(tmp_path, cfg)
+    runner.last_iteration, runner.final_std, runner.settle = 200, 0.1, 0.5
+    for iteration, std in ((0, 0.8), (100, 0.8), (150, math.sqrt(0.08)), (200, 0.1), (250, 0.1)):
+        runner.set_noise(iteration)
+        found = runner.alg.actor.distribution.log_std_param
+        torch.testing.assert_close(found.exp(), torch.full((12,), std))
+        assert not found.requires_grad
+    learned = make_runner(tmp_path)
+    before = learned.alg.actor.distribution.log_std_param.clone()
+    learned.set_noise(150)
+    assert torch.equal(learned.alg.actor.distribution.log_std_param, before), "its own to learn"
 
 
 def test_a_checkpoint_says_how_it_was_made(trained):

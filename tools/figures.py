@@ -22,7 +22,6 @@ COLORS = {
     "getup": "#6d597a",
     "stand": "#adb5bd",
     "walk": "#457b9d",
-    "roll": "#b56576",
 }
 
 

@@ -38,6 +38,8 @@ class PpoCfg:
         entropy: weight of the action entropy.
         clip: of the probability ratio.
         init_std: of the action noise, in network units.
+        final_std: what it falls to, geometrically over the last iterations; 0: it is learned.
+        settle: share of the iterations, the last ones, in which it falls.
         mirror: weight of the mean squared difference between the action on the mirror image of what the robot
             sees and the mirror image of its action (Mittal et al. 2024); 0 for none.
         hidden: layer sizes of actor and critic.
@@ -55,6 +57,8 @@ class PpoCfg:
     entropy: float = 0.005
     clip: float = 0.2
     init_std: float = 0.35
+    final_std: float = 0.0
+    settle: float = 0.5
     mirror: float = 0.0
     hidden: tuple[int, ...] = (256, 128, 64)
     algorithm: str = "PPO"
@@ -100,7 +104,12 @@ def rsl_config(cfg: PpoCfg) -> dict[str, Any]:
     network = dict(
         class_name="MLPModel", hidden_dims=list(cfg.hidden), activation="swish", obs_normalization=True
     )
-    noise = dict(class_name="GaussianDistribution", init_std=cfg.init_std, std_type="log")
+    noise = dict(
+        class_name="GaussianDistribution",
+        init_std=cfg.init_std,
+        std_type="log",
+        learn_std=cfg.final_std == 0,
+    )
     symmetry = dict(data_augmentation_func=both_sides, use_mirror_loss=True, mirror_loss_coeff=cfg.mirror)
     return dict(
         num_steps_per_env=cfg.steps,

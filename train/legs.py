@@ -84,6 +84,7 @@ class LegsEnv(Go2Env):
         self._air = torch.zeros(sim.num_worlds, 4, device=sim.device)  # s since each foot left the ground
         self._since = torch.zeros(sim.num_worlds, device=sim.device)  # steps since the command
         self._astray = torch.zeros(sim.num_worlds, device=sim.device)  # sum of velocity errors since then
+        self._beyond = torch.zeros(sim.num_worlds, 12, device=sim.device)  # rad, of the targets asked for
         self._walks = cfg.mode == "walk"
         super().__init__(
             cfg, sim, STAND, starts, cfg.rewards.termination, zeros, MIRROR if self._walks else ()
@@ -98,12 +99,27 @@ class LegsEnv(Go2Env):
         self._since += 1
         self._astray += (velocity - command)[:, :2].norm(dim=1)
         terms = legs_rewards(
-            self.cfg.rewards, x, before, u, u_prev, velocity, command, landed, self.sim.dt, gap
+            self.cfg.rewards,
+            x,
+            before,
+            u,
+            u_prev,
+            velocity,
+            command,
+            landed,
+            self._beyond,
+            self.sim.dt,
+            gap,
         )
         if self._walks:
             new = torch.rand(self.num_envs, device=self.device) < self.sim.dt / self.cfg.command.every
             self._command(choose(new))
         return terms
+
+    def targets(self, actions: Tensor) -> Tensor:
+        u = super().targets(actions)
+        self._beyond = self._pose + self.cfg.action_scale * actions - u
+        return u
 
     def fallen(self, x: Tensor, gap: Gap) -> Tensor:
         late = self.episode_length_buf * self.sim.dt > self.cfg.grace

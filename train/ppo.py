@@ -124,7 +124,9 @@ def set_up(args: Args, argv: Sequence[str] | None = None) -> Runner:
         runner.resume(str(checkpoint))
     runner.last_iteration = args.iterations or cfg.ppo.iterations
     runner.anneal = cfg.ppo.anneal
+    runner.final_std, runner.settle = cfg.ppo.final_std, cfg.ppo.settle
     runner.set_learning_rate(runner.current_learning_iteration)
+    runner.set_noise(runner.current_learning_iteration)
     return runner
 
 
@@ -138,7 +140,7 @@ def train(runner: Runner, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with runner.table.live or contextlib.nullcontext():
         try:
-            runner.learn(runner.last_iteration - first, init_at_random_ep_len=first == 0)
+            runner.learn(runner.last_iteration - first, init_at_random_ep_len=True)
         except KeyboardInterrupt:
             done = runner.save_interrupted()
             note = f"go on with --resume (checkpoint in {folder})" if done else "nothing was learned yet"

@@ -141,7 +141,8 @@ class LegsRewardCfg(EffortCfg):
     Attributes:
         upright: o.
         height: o h.
-        posture: o h exp(-|q - q_home|^2 / 2) [rad].
+        posture: o h exp(-|q - q_home|^2 / width).
+        width: squared distance from the pose at which posture has fallen to 1 / e [rad^2].
         stillness: o h exp(-|v|^2 - 0.1 |omega|^2) where the command is to stand, v [m/s], omega [rad/s].
         track: o h exp(-|v - v_command|^2 / 0.15), over the ground.
         turn: o h exp(-(omega_z - omega_command)^2 / 0.25).
@@ -150,11 +151,14 @@ class LegsRewardCfg(EffortCfg):
         trot: 1 while the robot is to move and exactly one pair of diagonal feet is on the ground.
         bounce: v_z^2 + 0.05 (omega_x^2 + omega_y^2).
         touch: number of thighs and shins on the ground, and of trunks.
+        beyond: sum of squared distances of the joint targets that the policy asks for from the joints' ranges
+            [rad^2]: out there nothing tells it the way back.
     """
 
     upright: float = 1.0
     height: float = 1.0
     posture: float = 0.5
+    width: float = 2.0
     stillness: float = 0.5
     track: float = 0.0
     turn: float = 0.0
@@ -162,6 +166,7 @@ class LegsRewardCfg(EffortCfg):
     trot: float = 0.0
     bounce: float = 0.0
     touch: float = 0.1
+    beyond: float = 0.0
 
 
 def legs_rewards(
@@ -173,6 +178,7 @@ def legs_rewards(
     velocity: Tensor,
     command: Tensor,
     landed: Tensor,
+    beyond: Tensor,
     dt: float,
     gap: dict[str, Tensor],
 ) -> dict[str, Tensor]:
@@ -187,6 +193,7 @@ def legs_rewards(
         velocity: forward, sideways [m/s] and turn [rad/s], (n, 3).
         command: what it should be, likewise.
         landed: of feet on the ground, how long they were in the air until this step [s], (n, 4).
+        beyond: how far the joint targets that were asked for are out of the joints' ranges, (n, 12) [rad].
         dt: control step [s].
         gap: `clearances` of x.
     """
@@ -204,7 +211,7 @@ def legs_rewards(
     terms = {
         "upright": cfg.upright * upright,
         "height": cfg.height * high,
-        "posture": cfg.posture * high * torch.exp(-0.5 * (q - constant(go2.HOME, q)).square().sum(1)),
+        "posture": cfg.posture * high * torch.exp(-(q - constant(go2.HOME, q)).square().sum(1) / cfg.width),
         "stillness": cfg.stillness * torch.where(moves, 0.0, still),
         "track": cfg.track * high * torch.exp(-off[:, :2].square().sum(1) / 0.15),
         "turn": cfg.turn * high * torch.exp(-off[:, 2].square() / 0.25),
@@ -212,5 +219,6 @@ def legs_rewards(
         "trot": cfg.trot * (moves & trot),
         "bounce": -cfg.bounce * (x[:, 21].square() + 0.05 * x[:, 22:24].square().sum(1)),
         "touch": -cfg.touch * touching,
+        "beyond": -cfg.beyond * beyond.square().sum(1),
     }
     return terms | efforts(cfg, x, before, torque, u, u_prev, dt)

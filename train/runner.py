@@ -50,7 +50,7 @@ class Runner(OnPolicyRunner):
         self.meta = meta
         self._fuse()
         self.last_iteration = self.updates = 0
-        self.anneal = 0.0
+        self.anneal = self.final_std = self.settle = 0.0
         self.logger.git_status_repos.clear()  # it looks for its own repository and says that there is none
         self.table = LiveTable(self)
         self._log = self.logger.log
@@ -132,6 +132,14 @@ class Runner(OnPolicyRunner):
         for group in self.alg.optimizer.param_groups:
             group["lr"] = rate
 
+    def set_noise(self, iteration: int) -> None:
+        """That of an iteration: as learned, or falling as configured over the last ones."""
+        if self.final_std:
+            first = self.cfg["actor"]["distribution_cfg"]["init_std"]
+            left = (self.last_iteration - iteration) / max(1.0, self.settle * self.last_iteration)
+            std = first * (self.final_std / first) ** (1.0 - min(1.0, max(0.0, left)))
+            self.alg.actor.distribution.log_std_param.data.fill_(math.log(std))
+
     def _fuse(self) -> None:
         """Let the optimiser update all of its parameters in one pass: a third of the time on a CPU."""
         for group in self.alg.optimizer.param_groups:
@@ -161,6 +169,7 @@ class Runner(OnPolicyRunner):
     def _log_quietly(self, **kwargs: Any) -> None:
         self.updates += 1
         self.set_learning_rate(kwargs["it"] + 1)
+        self.set_noise(kwargs["it"] + 1)
         tell_overflow(self.env.sim)
         if self.logger.disable_logs:
             return

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from hmc.cost import Cost
-from hmc.go2 import facts
 from hmc.go2 import model as go2
 from hmc.go2.observe import anchor_of
 from hmc.go2.policy import Policy
-from hmc.go2.stances import FOOTSTAND, MIN_STAND
+from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import (
     FOOT_TARGET,
     HAND_TARGET,
@@ -27,7 +26,7 @@ from hmc.go2.task import (
     policy_path,
     stance_cost,
 )
-from hmc.modes import ModeSet, Motion
+from hmc.modes import ModeSet
 from hmc.rules import Rules
 from hmc.task import Task
 
@@ -58,33 +57,6 @@ class GoalCfg:
 
 
 @dataclass(frozen=True)
-class RollCfg:
-    """A motion that turns a robot on its back over, written by tools/roll_motion.py.
-
-    Attributes:
-        spacing: control steps between its points.
-        points: joint positions [rad], 12 each.
-    """
-
-    spacing: int = 12
-    points: tuple[tuple[float, ...], ...] = (facts.HOME,)
-
-    def __post_init__(self) -> None:
-        if not self.points or any(len(point) != 12 for point in self.points) or self.spacing < 2:
-            raise ValueError(
-                f"a roll is points of 12 joints, 2 or more control steps apart: got {self.points}, "
-                f"{self.spacing} apart: write it with tools/roll_motion.py"
-            )
-
-    @staticmethod
-    def through(points: Tensor, spacing: int) -> Tensor:
-        """Inputs (P spacing, 12) that go to each of the points (P, 12) in half of its time and hold it."""
-        before = torch.cat([go2.HOME.to(points)[None], points[:-1]])
-        share = (torch.arange(1, spacing + 1) / (spacing // 2)).clamp(max=1.0).to(points)[:, None]
-        return (before[:, None] + share * (points - before)[:, None]).flatten(0, 1)
-
-
-@dataclass(frozen=True)
 class CourseCfg:
     """The course.
 
@@ -95,7 +67,6 @@ class CourseCfg:
         level: weight of (1 - cos tilt)^2 on four legs: Table I does not tell a robot on its back from one on
             its feet.
         place: weight of the distance from where the robot is to be [1/m].
-        roll: how a robot on its back turns over.
     """
 
     horizon: int = 75
@@ -103,7 +74,6 @@ class CourseCfg:
     cost: CostCfg = field(default_factory=CostCfg)
     level: float = 0.5
     place: float = 1.0
-    roll: RollCfg = field(default_factory=RollCfg)
 
     def __post_init__(self) -> None:
         if not self.goals:
@@ -179,10 +149,10 @@ def towards(cfg: CourseCfg) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 0) -> Task:
-    """The course with modes roll, getup, stand, walk, foot, jump and hand.
+    """The course with modes getup, stand, walk, foot, jump and hand.
 
     Nobody says which one runs when. A foot stand may begin on four legs or on two, a jump in the foot stand
-    only, a roll wherever the robot does not stand: all else need not be rolled out.
+    only: all else need not be rolled out.
 
     Args:
         cfg: settings.
@@ -191,10 +161,8 @@ def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 
         threads: of the engine and the policies; 0 for all cores.
     """
     sim = partial(make_sim, threads=threads)
-    roll = RollCfg.through(torch.tensor(cfg.roll.points, dtype=torch.float64), cfg.roll.spacing)
     modes = ModeSet(
         [
-            Motion("roll", roll),
             Policy(policy_path("getup"), threads=threads),
             Policy(policy_path("stand"), name="stand", threads=threads),
             Policy(policy_path("walk"), threads=threads, command=towards(cfg)),
@@ -206,7 +174,6 @@ def course_task(cfg: CourseCfg, jump: JumpCfg, *, seed: int = 0, threads: int = 
     rules = Rules(
         dwell={"jump": jump.dwell} if jump.dwell else {},
         guards={
-            "roll": lambda x, k: x[:, 2] < MIN_STAND,
             "walk": lambda x, k: _on_legs(x),
             "foot": lambda x, k: _on_legs(x) | (FOOTSTAND.uprightness(x) > 0.3),
             "jump": lambda x, k: FOOTSTAND.held(x),
