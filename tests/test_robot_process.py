@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -28,8 +29,8 @@ from hmc.go2 import model as go2
 from tools.go2_robot import main
 from tools.robot.motors import hold
 from tools.robot.orders import obey
-from tools.robot.process import Args, run
-from tools.robot.standin import Settings, StandIn
+from tools.robot.process import Args, Log, run
+from tools.robot.standin import Settings, StandIn, Truth, ideal
 
 ROOT = Path(__file__).parent.parent
 DOMAIN = 120 + os.getpid() % 100  # not that of test_dds.py: a killed robot lingers
@@ -160,3 +161,24 @@ def test_errors_are_one_line(
     assert err.startswith("go2_robot: ")
     assert told in err
     assert err.count("\n") == 1
+
+
+def test_a_long_log_leaves_the_garbage_collector_nothing_to_walk_over(tmp_path: Path) -> None:
+    """As an object a step, it took 36 ms after 400 s, and 0.2 s after 25 minutes."""
+    log, robot = Log(tmp_path / "truth.npz"), StandIn(ideal())
+    kept: list[Truth] = []
+    gc.collect()
+    before = len(gc.get_objects())
+    for _ in range(Log.BLOCK + 10):
+        robot.step([])
+        log.add(robot.truth())
+        kept = [*kept[-1:], robot.truth()]
+    gc.collect()
+    assert len(gc.get_objects()) < before + 200
+    log.write()
+    with np.load(tmp_path / "truth.npz") as found:
+        assert set(found) == set(Truth._fields)
+        assert (np.diff(found["tick"].astype(int)) == 2).all()
+        for name in Truth._fields:
+            assert len(found[name]) == Log.BLOCK + 10
+            assert np.array_equal(found[name][-2:], [getattr(truth, name) for truth in kept])
