@@ -27,6 +27,9 @@ LOSSES = {
 }
 
 
+# What mypy passes over in kernels is Warp's language, whose types index and add otherwise than Python's.
+
+
 @wp.kernel
 def take(
     worlds: wp.array[wp.int64],
