@@ -27,7 +27,7 @@ from train.runner import read_checkpoint
 
 SMALL = {
     "engine": (
-        Engine(threads=1, worlds=4, steps=2, repeats=2),
+        Engine(threads=1, worlds=4, steps=2, horizon=3, repeats=2),
         {
             "open_loop_efficiency",
             "open_loop_steps_per_s",
@@ -37,6 +37,8 @@ SMALL = {
             "policy_steps_per_s",
             "evaluator_efficiency",
             "evaluator_open_loop_efficiency",
+            "evaluator_few_efficiency",
+            "evaluator_few_open_loop_efficiency",
         },
     ),
     "train": (

@@ -6,7 +6,7 @@ import itertools
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -21,7 +21,7 @@ from hmc.go2.model import HOME, Q_LOWER, Q_UPPER, load_model
 from hmc.go2.policy import Policy
 from hmc.go2.stances import HANDSTAND
 from hmc.go2.task import CostCfg, policy_path, stance_cost
-from hmc.modes import ModeSet, Motion
+from hmc.modes import Mode, ModeSet, Motion
 from hmc.rollout import roll
 from hmc.schedule import Schedule, SwitchSpace
 from hmc.sim.ids import Ids, where
@@ -43,6 +43,7 @@ class Engine(Common):
     Attributes:
         worlds: stepped together.
         steps: control steps of a repeat.
+        horizon: of the search of all of Omega, control steps.
         repeats: of each side.
         policy: file of the policy mode; default: the handstand that comes with the package.
         clock: wall, or cpu: time that all threads spent together, for one thread on a busy machine.
@@ -50,6 +51,7 @@ class Engine(Common):
 
     worlds: int = 256
     steps: int = 20
+    horizon: int = 50
     repeats: int = 15
     policy: Path | None = None
     clock: Literal["wall", "cpu"] = "wall"
@@ -150,11 +152,16 @@ def engine(args: Engine) -> Figures:
         policy = Policy(path, name="hand", threads=threads)
         words = "random policy" if path.name == "random.onnx" else path.name
         _policy_mode(figures, args, sim, bare, policy, words)
-        other = Policy(path, name="other", threads=threads)
-        _evaluator(figures, args, sim, bare, "evaluator", ModeSet([policy, other]), words)
+        policies = [Policy(path, name=name, threads=threads) for name in ("hand", "other", "third")]
+        _evaluator(figures, args, "evaluator", policies, args.horizon, words)
+        _evaluator(figures, args, "evaluator_few", policies[:2], args.steps, words)
     pose = HANDSTAND.pose.double()
-    played = [Motion(name, pose + 0.1 * torch.randn(args.steps, 12).double()) for name in ("hand", "other")]
-    _evaluator(figures, args, sim, bare, "evaluator_open_loop", ModeSet(played), "motions")
+    played = [
+        Motion(mode.name, pose + 0.1 * torch.randn(args.horizon, 12, dtype=torch.float64))
+        for mode in policies
+    ]
+    _evaluator(figures, args, "evaluator_open_loop", played, args.horizon, "motions")
+    _evaluator(figures, args, "evaluator_few_open_loop", played[:2], args.steps, "motions")
     return figures
 
 
@@ -187,20 +194,24 @@ def _policy_mode(
 
 
 def _evaluator(
-    figures: Figures, args: Engine, sim: MujocoSim, bare: Bare, name: str, modes: ModeSet, words: str
+    figures: Figures, args: Engine, name: str, modes: Sequence[Mode], horizon: int, words: str
 ) -> None:
-    """The planner's rollouts of single switches, costs included, against the steps that they come to."""
+    """The planner's rollouts of all single switches, costs included, against the steps that they come to."""
+    space = SwitchSpace(len(modes), horizon)
+    others = torch.arange(len(space) // len(modes), len(space))  # into the mode that runs nothing changes
+    schedules = space.stitch(Schedule.constant(0, horizon), others)
+    model, many = load_model(), len(others)
+    sim = MujocoSim(model, many, substeps=SUBSTEPS, threads=args.threads)
+    bare = Bare(model, many, args.threads)
     cost = stance_cost(CostCfg(), lambda k: k >= 0)
-    task = Task("hold", modes, cost, args.steps, lambda n: sim)
+    task = Task("hold", ModeSet(modes), cost, horizon, lambda n: sim)
     start = make_start(task, sim, HANDSTAND.state(), HANDSTAND.pose.double(), None, None, 0, None)
-    space, worlds = SwitchSpace(2, args.steps), Worlds(task, sim)
-    into_other = torch.arange(len(space) // 2, len(space))[: args.worlds]
-    schedules = space.stitch(Schedule.constant(0, args.steps), into_other)
+    worlds = Worlds(task, sim)
     trunk, step = roots(worlds, [start]), sim.step
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def keep(u: Tensor, ids: Ids = None) -> None:
-        index = torch.arange(args.worlds)[where(ids)]
+        index = torch.arange(many)[where(ids)]
         steps.append((index.numpy(), sim.save(ids).numpy(), u.numpy()))
         step(u, ids)
 
@@ -220,8 +231,9 @@ def _evaluator(
             bare.batch.step(ids, nstep=SUBSTEPS)
         yield
 
-    times = take_turns(rollouts, whole, args.repeats, args.clock)
+    times = take_turns(rollouts, whole, max(1, args.repeats // 3), args.clock)
     last = steps[-1][0]
     same(sim.save().numpy()[last], bare.batch.state[last], name)
     made = sum(len(ids) for ids, _, _ in steps) * SUBSTEPS
-    add_ratio(figures, name, times, made, f"{len(schedules)} schedules with costs, {words}")
+    what = f"{many} schedules with costs, T {horizon}, M {len(modes)}, {words}"
+    add_ratio(figures, name, times, made, what)
