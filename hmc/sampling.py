@@ -327,11 +327,11 @@ class SamplingMpc(Mode):
         return theta + self._along_basis(move), std, (plans, costs)
 
     def _along_basis(self, noise: Tensor) -> Tensor:
-        """Noise (..., d) as noise of the inputs, (..., nu); summed in one order, whatever the batch."""
-        inputs = noise.new_zeros(*noise.shape[:-1], self.nu)
-        for along, row in zip(noise.unbind(-1), self._constants(noise).basis, strict=True):
-            inputs = inputs + along[..., None] * row
-        return inputs
+        """Noise (..., d) as noise of the inputs, (..., nu); summed in one order, by numpy as well."""
+        here, basis = noise.device.type == "cpu", self._constants(noise).basis
+        parts, rows = (noise.numpy(), basis.numpy()) if here else (noise, basis)
+        inputs = sum(parts[..., j, None] * row for j, row in enumerate(rows))
+        return torch.from_numpy(inputs) if here else inputs
 
     def _noise(self, k: Tensor, iteration: int, like: Tensor | None = None) -> Tensor:
         """Standard normal noise of each world's samples, (n, S, K, d), by (seed, k, iteration) alone.

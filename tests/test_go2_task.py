@@ -129,6 +129,11 @@ def test_terms_at_once_are_those_one_by_one(n, spread):
     plain = replace(COST, on_cpu=None).stage_terms(*given)
     torch.testing.assert_close(COST.stage_terms(*given), plain, rtol=0, atol=0, equal_nan=True)
     assert plain[0].isnan().any()
+    tail, differentiable = (
+        COST.terminal_terms(x, given[3]),
+        COST.terminal_terms(x.clone().requires_grad_(), given[3]),
+    )
+    torch.testing.assert_close(tail, differentiable.detach(), rtol=0, atol=0)
 
 
 def test_tail():

@@ -11,9 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hmc.cost import Cost, StageFn
+from hmc.cost import Cost, StageFn, TerminalFn
 from hmc.go2 import model as go2
 from hmc.go2.ensemble import EnsembleCfg, make_ensemble
 from hmc.go2.network import rotation
@@ -26,6 +27,7 @@ from hmc.sampling import SamplingCfg, SamplingMpc
 from hmc.sim import make as engines
 from hmc.sim.base import Sim
 from hmc.task import Task
+from hmc.trace import Floats
 
 TARGETS = (FOOTSTAND, HANDSTAND, STAND)  # what a cost may ask for
 FOOT_TARGET, HAND_TARGET, STAND_TARGET = range(3)
@@ -156,7 +158,11 @@ def stance_cost(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> Cost:
         home = _targets(x.dtype, x.device)[2][STAND_TARGET]
         return cfg.pose * torch.exp(-(x[:, 7:19] - home).square().sum(1))
 
+    stage_in_numpy, tail_in_numpy = _in_numpy(cfg, target)
+
     def tail(x: Tensor, k: Tensor) -> Tensor:
+        if x.device.type == "cpu" and x.dtype == torch.float64 and not x.requires_grad:
+            return tail_in_numpy(x, k)
         return cfg.tail * (height(x, k) + orientation(x, k) + joints(x, k))
 
     stage: dict[str, StageFn] = {
@@ -167,16 +173,23 @@ def stance_cost(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> Cost:
         "energy": energy,
         "pose": pose,
     }
-    return Cost(stage, {"tail": tail}, nonnegative=True, on_cpu=_in_numpy(cfg, target))
+    return Cost(stage, {"tail": tail}, nonnegative=True, on_cpu=stage_in_numpy)
 
 
-def _in_numpy(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> StageFn:
-    """The stage terms of `stance_cost` by the same operations: for few states a torch operation takes several
-    times as long as one of numpy's. What adds numbers up is torch's, in its order."""
+def _in_numpy(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> tuple[StageFn, TerminalFn]:
+    """The stage terms of `stance_cost` and its tail by the same operations: for few states a torch operation
+    takes several times as long as one of numpy's. What adds numbers up is torch's, in its order."""
     weights = np.array([cfg.height, cfg.orientation, cfg.joints, cfg.rate, cfg.energy, cfg.pose])[:, None]
     cpu = torch.float64, torch.device("cpu")
     heights, gravity, poses = (each.numpy() for each in _targets(*cpu))
     stall, peak, negative, slope = (each.numpy() for each in go2.motor_curve(*cpu))
+
+    def place(state: Floats, at: NDArray[np.int64], found: Floats) -> None:
+        """Height and orientation without their weights, into `found` (2, n)."""
+        ahead, sideways = rotation(state, slice(6, 8))
+        ahead += gravity[at]
+        below = heights[at] - state[:, 2]
+        found[0], found[1] = below * below, ahead * ahead + sideways * sideways
 
     def terms(x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
         state, inputs, at = x.numpy(), u.numpy(), target(k).long().numpy()
@@ -187,21 +200,29 @@ def _in_numpy(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> StageFn:
         np.subtract(q, poses[STAND_TARGET], out=away[2])
         away *= away
         squares = torch.from_numpy(away).sum(2)
-        ahead, sideways = rotation(state, slice(6, 8))
-        ahead += gravity[at]
-        below = heights[at] - state[:, 2]
         torque, back = go2.KP * (inputs - q) - go2.KD * qd, slope * qd
         top = np.minimum(np.maximum(stall - back, negative), peak)
         bottom = np.minimum(np.maximum(-stall - back, negative), peak)
         power = torch.from_numpy(qd * np.minimum(np.maximum(torque, bottom), top))
         found = np.empty((6, len(state)))
-        found[0], found[1] = below * below, ahead * ahead + sideways * sideways
+        place(state, at, found[:2])
         found[2:4] = squares[:2]
         found[4], found[5] = torch.linalg.vector_norm(power, dim=1), torch.exp(-squares[2])
         found *= weights
         return torch.from_numpy(found).T
 
-    return terms
+    def tail(x: Tensor, k: Tensor) -> Tensor:
+        state, at = x.numpy(), target(k).long().numpy()
+        away = state[:, 7:19] - poses[at]
+        away *= away
+        found = np.empty((3, len(state)))
+        place(state, at, found[:2])
+        found[2] = torch.from_numpy(away).sum(1)
+        found *= weights[:3]
+        height, orientation, joints = found
+        return torch.from_numpy(cfg.tail * (height + orientation + joints))
+
+    return terms, tail
 
 
 def with_values(cost: Cost, weight: float, hand: Callable[[Tensor], Tensor], threads: int = 1) -> Cost:
