@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,22 +85,6 @@ def roll(
     return rollout.rolled(len(tree.row) - len(schedules))
 
 
-@torch.no_grad()
-def record(worlds: Worlds, known: Traces, schedule: Sequence[int]) -> Traces:
-    """Roll out one schedule from where `known` begins, and record it on each member.
-
-    The steps in which the two schedules agree are taken over from `known`.
-    """
-    modes = tuple(schedule)
-    if modes == known[0].modes:
-        return known
-    none = torch.empty(0, len(modes), dtype=torch.long)
-    rolled = roll(worlds, known, none, recorded=modes)
-    assert rolled is not None
-    assert rolled.trace is not None
-    return rolled.trace
-
-
 class _Rollout:
     """A tree of n branches being rolled out on E members; arguments as of `roll`.
 
@@ -125,7 +109,7 @@ class _Rollout:
         self.terms = np.full((len(task.cost.names), n * self.members), math.nan)  # of those that arrived
         self.result = np.full(n, math.inf)
         self.pruned, self.barred = np.zeros((2, n), dtype=bool)
-        self.cheap = bool(getattr(worlds.sim, "cheap", False))
+        self.cheap = worlds.cheap
         self._go_on(slice(0, 0))  # a slice while none has ended
         self.crew: Crew | None = None  # who acts in them; None: to be found out
         self.changes = [True, *(self.modes[1:] != self.modes[:-1]).any(1).tolist()]

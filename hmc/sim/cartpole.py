@@ -82,8 +82,8 @@ class CartpoleSim:
         self._weights = 1 / 3, 2 / (3 * h), c.pole_length * 2 / (3 * h)
         # as arrays, which numpy takes as they are
         self._factors = tuple(map(np.array, self._scale)), np.array(self._weights)[:, None]
-        self._one = np.empty((3, 1))  # an angle, its sine and its cosine
-        self._of_one = tuple(map(torch.from_numpy, self._one))
+        self._one = np.empty(3)  # an angle, its sine and its cosine
+        self._of_one = torch.from_numpy(self._one).split(1)
         self._scratch = _aligned(14, min(num_worlds, BLOCK)).numpy()
 
     @property
@@ -122,7 +122,7 @@ class CartpoleSim:
 
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
-        columns, force = self._of(ids).numpy(), u[:, 0].to(self.dtype).numpy()
+        columns, force = self._of(ids).numpy(), u.to(self.dtype).numpy()[:, 0]
         if len(force) == 1:  # a plan steps hundreds of worlds singly, for which arrays are slow
             at = int(ids[0]) if isinstance(ids, Tensor) else (ids or slice(None)).indices(self.num_worlds)[0]
             columns[:, at] = *self._after(columns[:4, at].tolist(), force.item(), self._sin_cos), force[0]
@@ -239,10 +239,10 @@ class CartpoleSim:
     def _sin_cos(self, angle: float) -> list[float]:
         """Sine and cosine of one angle, to the bit as of many."""
         one, sin, cos = self._of_one
-        self._one[0, 0] = angle
+        self._one[0] = angle
         torch.sin(one, out=sin)
         torch.cos(one, out=cos)
-        return self._one.ravel().tolist()[1:]
+        return self._one.tolist()[1:]
 
     def save(self, ids: Ids = None) -> Tensor:
         return fresh(self._of(ids), ids, 1).T
