@@ -166,29 +166,31 @@ class _Rollout:
         """What came of the schedules from row `first` on; of row 0 the traces, if it was watched."""
         ended = ~np.isfinite(self.result)
         diverged = ended & ~self.pruned & ~self.barred
-        recorder, tree, barred = self.recorder, self.tree, self.barred.tolist()
-        terms = torch.from_numpy(self.terms).T.reshape(-1, self.members, len(self.terms))
+        recorder, tree, barred = self.recorder, self.tree, self.barred
+
+        def by_branch(terms: Floats) -> Tensor:
+            return torch.from_numpy(terms).T.unflatten(0, (-1, self.members))
+
+        ends = by_branch(self.terms[self.stages :])
 
         def traces(row: int) -> Traces:
             assert recorder is not None
             path = tree.path(row)
             last = path[-1]
-            modes = tuple(tree.modes[last].tolist())
-            return recorder.traces(modes, path, terms[last, :, self.stages :], barred[last])
+            return recorder.traces(tuple(tree.modes[last].tolist()), path, ends[last], bool(barred[last]))
 
-        at = torch.empty_like(tree.row)
-        at[tree.row] = torch.arange(len(at))
+        at = np.empty(len(tree.row), dtype=np.int64)
+        at[tree.row.numpy()] = np.arange(len(at))
         at = at[first:]
-        known = terms[at].masked_fill(torch.from_numpy(ended | self.pruned)[at, None, None], math.nan)
-        result, given_up, out = (
-            torch.from_numpy(each)[at] for each in (self.result, self.pruned, self.barred)
-        )
+        terms = self.terms.take(self._blocks(at), 1)
+        terms[:, self._each((ended | self.pruned)[at])] = math.nan
+        known = by_branch(terms)
         return Rolled(
-            result,
+            torch.from_numpy(self.result[at]),
             known[:, 0] if self.ensemble is None else self.ensemble.terms(known),
-            torch.from_numpy(diverged)[at],
-            given_up,
-            out,
+            torch.from_numpy(diverged[at]),
+            torch.from_numpy(self.pruned[at]),
+            torch.from_numpy(barred[at]),
             traces(0) if self.path else None,
             None if recorder is None or recorder.path is not None else lambda row: traces(first + row),
         )

@@ -39,11 +39,13 @@ class Table:
         fresh = range(self._size, self._size + len(keys))
         rows = np.fromiter(map(row.setdefault, keys, fresh), np.int64, len(keys))
         self._size = max(self._size, int(rows.max(initial=-1)) + 1)
-        while self._size > len(self._cost):
+        room = len(self._cost)
+        if self._size > room:
+            more = max(self._size - room, room)
             # of a new row nothing is known: a bound that answers nobody
-            self._cost = np.concatenate([self._cost, np.full_like(self._cost, -math.inf)])
-            self._bound = np.concatenate([self._bound, np.ones_like(self._bound)])
-            self._terms = np.concatenate([self._terms, np.empty_like(self._terms)])
+            self._cost = np.concatenate([self._cost, np.full(more, -math.inf)])
+            self._bound = np.concatenate([self._bound, np.ones(more, dtype=bool)])
+            self._terms = np.concatenate([self._terms, np.empty((more, self._terms.shape[1]))])
         return rows
 
     def _keys(self, steps: NDArray[np.integer]) -> list[bytes]:
