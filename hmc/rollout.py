@@ -112,7 +112,6 @@ class _Rollout:
         self.cheap = worlds.cheap
         self._go_on(slice(0, 0))  # a slice while none has ended
         self.crew: Crew | None = None  # who acts in them; None: to be found out
-        self.changes = [True, *(self.modes[1:] != self.modes[:-1]).any(1).tolist()]
         # what cannot end a branch on the way is looked at now and then only
         self.watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
         # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost,
@@ -150,7 +149,7 @@ class _Rollout:
             x, u_prev = self._give_up(i, x, u_prev)
         if self.size == 0:
             return
-        if self.crew is None or self.changes[i]:
+        if self.crew is None or (self.modes[i] != self.modes[i - 1]).any():
             modes = self._each(self.modes[i, self.ids])
             self.crew = self.worlds.crew(self.at, modes, modes if self.constant else self._before(i))
         u = self.worlds.act(self.crew, x, u_prev, k)

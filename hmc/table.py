@@ -50,9 +50,9 @@ class Table:
 
     def _keys(self, steps: NDArray[np.integer]) -> list[bytes]:
         """What schedules (T, N) are looked up by."""
-        words = steps[:: self._fit]
+        words = steps[:: self._fit].copy()
         for i in range(1, self._fit):
-            words = words * self._modes
+            words *= self._modes
             more = steps[i :: self._fit]
             words[: len(more)] += more
         rows = np.ascontiguousarray(words.T)
