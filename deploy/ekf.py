@@ -94,6 +94,7 @@ class Ekf:
         creep, late: c and l of the module.
         P: covariance of the error, (29, 29).
         stands: which feet are anchored, (4,) bool.
+        sway: how much each leg sways, 0 to 1, 4 (`deploy.sway`).
     """
 
     def __init__(self, cfg: NoiseCfg):
@@ -103,7 +104,7 @@ class Ekf:
         self.v, self.r, self.bw, self.bf = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         self.p = np.zeros((4, 3))
         self.creep = self.late = 0.0
-        self.stands = np.zeros(4, dtype=bool)
+        self.stands, self.sway = np.zeros(4, dtype=bool), [1.0] * 4
         self.P = np.eye(N)
         self._F, self._still = np.eye(N), np.eye(N)
         self._FP = np.empty((N, N))
@@ -212,7 +213,10 @@ class Ekf:
         """Diagonal of the step's noise, 29; `hidden` is the time [s^2] in which changes went unseen."""
         cfg = self.cfg
         shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
-        speed = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
+        hidden *= max(self.sway)
+        # noise of two readings is in their difference as well, where `predict` counts it once more
+        acc_white = cfg.acc**2 * (1.0 - 2.0 * cfg.sample**2)
+        speed = (acc_white + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
         angle = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
         place, gyro, acc = speed * dt * dt / 3.0, cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
         slide = (cfg.slide * self.creep) ** 2
@@ -222,8 +226,9 @@ class Ekf:
                 Q += (0.0, 0.0, 0.0)
                 continue
             (x, y, z), (across, down), (a, b) = roll[leg], loose[leg], pull[leg]
+            walk = cfg.firm**2 + (cfg.foot * self.sway[leg]) ** 2
             across += slide * (a * a + b * b)
-            foot = cfg.foot**2 * dt + cfg.roll**2 * math.sqrt(x * x + y * y + z * z)
+            foot = walk * dt + cfg.roll**2 * math.sqrt(x * x + y * y + z * z)
             Q += (foot + across * dt, foot + across * dt, foot + down * dt)
         Q += (cfg.creep_walk**2 * dt, 0.0)
         return Q
@@ -256,16 +261,17 @@ class Ekf:
         at, P = foot(leg), self.P
         P[at], P[:, at] = rows, rows.T
         block = rows[:, R] - rows[:, PHI] @ skew(arm).T
-        P[at, at] = 0.5 * (block + block.T) + self._place_variance() * _I3
+        P[at, at] = 0.5 * (block + block.T) + self._place_variance(leg) * _I3
         self.stands[leg] = True
 
-    def _place_variance(self) -> float:
+    def _place_variance(self, leg: int) -> float:
         """Of a foot's place by kinematics, along an axis [m^2].
 
         What is of second order in the tilt's error, (1/2) phi^2 s, would pass for knowledge of it.
         """
         tilt = float(self.P[0, 0] + self.P[1, 1])
-        return self.cfg.kinematics**2 + 0.5 * (_ARM * tilt) ** 2
+        place = self.cfg.encoder**2 + (self.cfg.kinematics * self.sway[leg]) ** 2
+        return place + 0.5 * (_ARM * tilt) ** 2
 
     def release(self, leg: int) -> None:
         """A foot lifts off, or cannot be trusted."""
@@ -296,7 +302,9 @@ class Ekf:
         e += [FOOT_RADIUS - p[leg][2] for leg in legs]
         PHt = self.P @ H.T
         S = H @ PHt
-        S.reshape(-1)[:: 4 * n + 1][: 3 * n] += self._place_variance()
+        diagonal = S.reshape(-1)[:: 4 * n + 1]
+        for k, leg in enumerate(legs):
+            diagonal[3 * k : 3 * k + 3] += self._place_variance(leg)
         self._legs, self._e, self._PHt, self._S = legs, np.array(e), PHt, S
         cells = S.tolist()
         return [distance(cells, e, 3 * k) for k in range(n)]

@@ -15,6 +15,7 @@ from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, lowest
 from deploy.noise import NoiseCfg
 from deploy.so3 import Array
 from deploy.start import Start, StartCfg
+from deploy.sway import Sway
 
 _I3 = np.eye(3)
 _UP = np.array([0.0, 0.0, 1.0])
@@ -108,6 +109,7 @@ class Estimator:
         self.contact, self._carried = np.zeros(4, dtype=bool), False
         self._t = self._good = -math.inf  # of the last tick, of the last with an IMU
         self._start = Start(self.cfg.start, self.cfg.noise.gyro)
+        self._sway = Sway(self.cfg.noise, self.cfg.period)
         self._imu = np.full(6, np.nan)  # of the last good tick
         self._q, self._qd = [math.nan] * 12, [0.0] * 12
         self._refused = [0.0] * 4  # for how long each foot has been left out [s]
@@ -144,6 +146,8 @@ class Estimator:
         if good:
             self._imu, self._good, blind = np.concatenate([gyro, acc]), t, blind - self.cfg.period
         known, turned = self._joints(q.tolist(), qd.tolist())
+        self._sway.update(turned, (self._imu[:3] - self.ekf.bw).tolist(), dt)
+        self.ekf.sway = self._sway.legs
         if not self._ready:
             self._begin(good, force.tolist(), dt)
             return self._estimate

@@ -16,7 +16,6 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)  # not this folder, whose modules are deploy's
 
-import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 
 from deploy.buttons import HELP, HOLD, Keyboard, Operator, Port, Presser  # noqa: E402
@@ -30,7 +29,7 @@ from deploy.slots import Board  # noqa: E402
 from deploy.timing import Stolen  # noqa: E402
 from deploy.view import View  # noqa: E402
 from hmc.cfg import load  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 
 LOOK = 0.05  # s
 START_UP = 60.0  # s for a process to be ready
@@ -252,4 +251,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args)))
+    sys.exit(main(command_line(Args)))

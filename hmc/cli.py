@@ -6,8 +6,8 @@ import contextlib
 import os
 import sys
 import warnings
-from collections.abc import Iterator
-from typing import TextIO
+from collections.abc import Iterator, Sequence
+from typing import Any, TextIO
 
 
 @contextlib.contextmanager
@@ -43,3 +43,27 @@ def one_line_errors() -> Iterator[None]:
         raise SystemExit(2) from None
     finally:
         warnings.showwarning = shown
+
+
+def command_line(kind: Any, args: Sequence[str] | None = None) -> Any:
+    """What a command line says, as `kind`; see `tyro.cli`.
+
+    An option that is given several times, such as --set, takes all of its values: tyro by itself takes the
+    last of them, and a run goes on without the others.
+    """
+    import tyro
+
+    return tyro.cli(kind, args=_gathered(sys.argv[1:] if args is None else args))
+
+
+def _gathered(words: Sequence[str]) -> list[str]:
+    """A command line whose options come once, each with all its values, where it comes first."""
+    groups: dict[str, list[str]] = {"": []}
+    option = ""
+    for word in words:
+        if word.startswith("--"):
+            option, equals, value = word.partition("=")
+            groups.setdefault(option, [option]).extend([value] if equals else [])
+        else:
+            groups[option].append(word)
+    return [word for group in groups.values() for word in group]

@@ -78,7 +78,9 @@ def total(terms: Tensor) -> Tensor:
 
 def total_by_term(terms: NDArray[np.float64]) -> NDArray[np.float64]:
     """`total` of terms (number of terms, n), (n,): to the bit, which numpy's own sum is not."""
-    cost = np.zeros(terms.shape[1])
-    for term in terms:
+    if len(terms) == 0:
+        return np.zeros(terms.shape[1])
+    cost: NDArray[np.float64] = terms[0] + 0.0  # a sum that begins with 0 is never -0
+    for term in terms[1:]:
         cost += term
     return cost

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from hmc.branches import added_steps, in_order
 from hmc.neighbours import Neighbours
-from hmc.rollout import Rolled, record, roll
+from hmc.record import record
+from hmc.rollout import Rolled, roll
 from hmc.schedule import Schedule
 from hmc.sim.base import Sim
 from hmc.start import Start

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,22 +85,6 @@ def roll(
     return rollout.rolled(len(tree.row) - len(schedules))
 
 
-@torch.no_grad()
-def record(worlds: Worlds, known: Traces, schedule: Sequence[int]) -> Traces:
-    """Roll out one schedule from where `known` begins, and record it on each member.
-
-    The steps in which the two schedules agree are taken over from `known`.
-    """
-    modes = tuple(schedule)
-    if modes == known[0].modes:
-        return known
-    none = torch.empty(0, len(modes), dtype=torch.long)
-    rolled = roll(worlds, known, none, recorded=modes)
-    assert rolled is not None
-    assert rolled.trace is not None
-    return rolled.trace
-
-
 class _Rollout:
     """A tree of n branches being rolled out on E members; arguments as of `roll`.
 
@@ -125,10 +109,9 @@ class _Rollout:
         self.terms = np.full((len(task.cost.names), n * self.members), math.nan)  # of those that arrived
         self.result = np.full(n, math.inf)
         self.pruned, self.barred = np.zeros((2, n), dtype=bool)
-        self.cheap = bool(getattr(worlds.sim, "cheap", False))
+        self.cheap = worlds.cheap
         self._go_on(slice(0, 0))  # a slice while none has ended
         self.crew: Crew | None = None  # who acts in them; None: to be found out
-        self.changes = [True, *(self.modes[1:] != self.modes[:-1]).any(1).tolist()]
         # what cannot end a branch on the way is looked at now and then only
         self.watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
         # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost,
@@ -166,7 +149,7 @@ class _Rollout:
             x, u_prev = self._give_up(i, x, u_prev)
         if self.size == 0:
             return
-        if self.crew is None or self.changes[i]:
+        if self.crew is None or (self.modes[i] != self.modes[i - 1]).any():
             modes = self._each(self.modes[i, self.ids])
             self.crew = self.worlds.crew(self.at, modes, modes if self.constant else self._before(i))
         u = self.worlds.act(self.crew, x, u_prev, k)
@@ -182,29 +165,31 @@ class _Rollout:
         """What came of the schedules from row `first` on; of row 0 the traces, if it was watched."""
         ended = ~np.isfinite(self.result)
         diverged = ended & ~self.pruned & ~self.barred
-        recorder, tree, barred = self.recorder, self.tree, self.barred.tolist()
-        terms = torch.from_numpy(self.terms).T.reshape(-1, self.members, len(self.terms))
+        recorder, tree, barred = self.recorder, self.tree, self.barred
+
+        def by_branch(terms: Floats) -> Tensor:
+            return torch.from_numpy(terms).T.unflatten(0, (-1, self.members))
+
+        ends = by_branch(self.terms[self.stages :])
 
         def traces(row: int) -> Traces:
             assert recorder is not None
             path = tree.path(row)
             last = path[-1]
-            modes = tuple(tree.modes[last].tolist())
-            return recorder.traces(modes, path, terms[last, :, self.stages :], barred[last])
+            return recorder.traces(tuple(tree.modes[last].tolist()), path, ends[last], bool(barred[last]))
 
-        at = torch.empty_like(tree.row)
-        at[tree.row] = torch.arange(len(at))
+        at = np.empty(len(tree.row), dtype=np.int64)
+        at[tree.row.numpy()] = np.arange(len(at))
         at = at[first:]
-        known = terms[at].masked_fill(torch.from_numpy(ended | self.pruned)[at, None, None], math.nan)
-        result, given_up, out = (
-            torch.from_numpy(each)[at] for each in (self.result, self.pruned, self.barred)
-        )
+        terms = self.terms.take(self._blocks(at), 1)
+        terms[:, self._each((ended | self.pruned)[at])] = math.nan
+        known = by_branch(terms)
         return Rolled(
-            result,
+            torch.from_numpy(self.result[at]),
             known[:, 0] if self.ensemble is None else self.ensemble.terms(known),
-            torch.from_numpy(diverged)[at],
-            given_up,
-            out,
+            torch.from_numpy(diverged[at]),
+            torch.from_numpy(self.pruned[at]),
+            torch.from_numpy(barred[at]),
             traces(0) if self.path else None,
             None if recorder is None or recorder.path is not None else lambda row: traces(first + row),
         )

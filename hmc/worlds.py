@@ -31,12 +31,13 @@ class Worlds:
     in each world. Branching a rollout copies both.
 
     Attributes:
+        cheap: whether the simulator says so of its steps.
         own_steps: control steps made so far, over all worlds.
         nested_steps: those that modes made inside themselves.
     """
 
     def __init__(self, task: Task, sim: Sim):
-        self.task, self.sim = task, sim
+        self.task, self.sim, self.cheap = task, sim, bool(getattr(sim, "cheap", False))
         self.own_steps = self.nested_steps = 0
         self._all = torch.arange(sim.num_worlds, device=sim.device)
         self.memory = torch.zeros(sim.num_worlds, task.modes.memory_size, dtype=sim.dtype, device=sim.device)

@@ -13,9 +13,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import tyro
 from rich.console import Console
 
+from hmc.cli import command_line
 from tests.squares import Job, Row, work, work_on_a_node
 from tools import cluster, robustness, study
 
@@ -113,7 +113,7 @@ def test_without_ray(tmp_path, monkeypatch, capsys):
 
 def test_command_line():
     def workers(*words: str) -> study.Workers:
-        args = tyro.cli(robustness.Args, args=words)
+        args = command_line(robustness.Args, args=words)
         return study.Workers(args.processes, args.ray)
 
     assert workers() == study.Workers()

@@ -14,9 +14,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-import tyro
 from rich.console import Console
 
+from hmc.cli import command_line
 from tools.benchmarks.engine import Engine, engine
 from tools.benchmarks.figures import NOT_MEASURED, cores, machine
 from tools.benchmarks.gpu import Gpu, gpu
@@ -63,4 +63,4 @@ def main(args: Engine | Train | Planner | Wire | Growth | Gpu) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Engine | Train | Planner | Wire | Growth | Gpu)))
+    sys.exit(main(command_line(Engine | Train | Planner | Wire | Growth | Gpu)))

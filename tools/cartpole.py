@@ -14,11 +14,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 
 from hmc.cfg import load  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from tools import cartpole_figures, study  # noqa: E402
 from tools.cartpole_study import Job, Row, StudyCfg, jobs, optimum, search, work  # noqa: E402
 
@@ -54,4 +53,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args)))
+    sys.exit(main(command_line(Args)))

@@ -17,14 +17,13 @@ sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from hmc import Task  # noqa: E402
 from hmc.cfg import load  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.model import DT  # noqa: E402
 from hmc.go2.observe import pitch  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
@@ -185,4 +184,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args)))
+    sys.exit(main(command_line(Args)))

@@ -8,9 +8,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import tyro
 
 from deploy.dds import LinkError
+from hmc.cli import command_line
 from tools.robot.process import Args, run
 
 
@@ -28,4 +28,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args)))
+    sys.exit(main(command_line(Args)))

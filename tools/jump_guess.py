@@ -14,12 +14,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import torch  # noqa: E402
-import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 from hmc.cfg import load  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2 import model as go2  # noqa: E402
 from hmc.go2.conditions import Conditions  # noqa: E402
 from hmc.go2.stances import FOOTSTAND, HANDSTAND  # noqa: E402
@@ -197,4 +196,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(command_line(Args))

@@ -23,7 +23,7 @@ from rich.console import Console  # noqa: E402
 
 from hmc import Evaluator, Schedule, SwitchSpace, Task, make_start  # noqa: E402
 from hmc.cfg import load  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
 from tools.closed_loop import RunCfg  # noqa: E402
 from tools.figures import save  # noqa: E402
@@ -152,4 +152,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(command_line(Args))

@@ -16,11 +16,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import torch  # noqa: E402
-import tyro  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from hmc.cfg import load  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, make_sim  # noqa: E402
 from tools.closed_loop import RunCfg  # noqa: E402
 from tools.jump_guess import settled_stands  # noqa: E402
@@ -81,4 +80,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(command_line(Args))

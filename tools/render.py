@@ -19,6 +19,8 @@ sys.path.insert(0, str(ROOT))
 
 import tyro  # noqa: E402
 
+from hmc.cli import command_line  # noqa: E402
+
 BACKENDS = ("egl", "osmesa", "glfw")
 EVERY = 2  # control steps a picture: without a GPU a picture takes a core 0.1 s
 
@@ -122,4 +124,4 @@ def images(states: NDArray[Any], width: int, height: int, samples: int) -> Itera
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(command_line(Args))

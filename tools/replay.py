@@ -25,7 +25,7 @@ from deploy.modes import NAMES  # noqa: E402
 from deploy.observe import pitch, vertical  # noqa: E402
 from deploy.safety import Phase  # noqa: E402
 from deploy.settings import InputCfg  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -147,4 +147,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(command_line(Args))

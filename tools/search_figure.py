@@ -12,10 +12,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import matplotlib.pyplot as plt  # noqa: E402
-import tyro  # noqa: E402
 from matplotlib.patches import Rectangle  # noqa: E402
 
 from hmc import Plan  # noqa: E402
+from hmc.cli import command_line  # noqa: E402
 from tools.figures import save  # noqa: E402
 
 COLORS = ("#7aa6c2", "#d1495b")
@@ -67,6 +67,6 @@ def draw(plan: Plan, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    args = tyro.cli(Args)
+    args = command_line(Args)
     draw(example()["plan"], args.out)
     print(args.out)

@@ -15,13 +15,12 @@ sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 from hmc import Receding, Task  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2 import model as go2  # noqa: E402
 from hmc.go2.conditions import Robots  # noqa: E402
 from hmc.go2.course import CourseCfg, GoalCfg, course_task  # noqa: E402
@@ -273,4 +272,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args)))
+    sys.exit(main(command_line(Args)))

@@ -18,7 +18,7 @@ import tyro  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 from hmc.cfg import load  # noqa: E402
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2 import model as go2  # noqa: E402
 from hmc.go2.conditions import Conditions, NoiseCfg, Robots  # noqa: E402
 from hmc.go2.network import Network  # noqa: E402
@@ -252,4 +252,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(command_line(Args))

@@ -18,12 +18,11 @@ sys.path.insert(0, str(ROOT))
 
 import onnx  # noqa: E402
 import torch  # noqa: E402
-import tyro  # noqa: E402
 from rsl_rl.models import MLPModel  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.facts import COMMANDS, OBS_SIZE, contract  # noqa: E402
 from hmc.go2.network import Network  # noqa: E402
 from hmc.go2.stances import HOLDS  # noqa: E402
@@ -144,4 +143,4 @@ def main(checkpoint: Path, out: Path, /, value: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    command_line(main)

@@ -14,9 +14,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import torch  # noqa: E402
-import tyro  # noqa: E402
 
-from hmc.cli import one_line_errors  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.sim.device import devices, used_up  # noqa: E402
 from hmc.sim.make import choose  # noqa: E402
 from train.config import metadata, read_training, rsl_config  # noqa: E402
@@ -182,4 +181,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(command_line(Args))

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hmc.sim.check import check
-from hmc.sim.ids import Ids, fresh, where
+from hmc.sim.ids import Ids
 
 Floats = NDArray[np.float64]
 T = TypeVar("T", float, Tensor)
-BLOCK = 6144  # worlds that are stepped at a time, at most: what is computed on the way stays in the cache
+BLOCK = 8192  # worlds that are stepped at a time, at most: what is computed on the way stays in the cache
 LINE = 8  # numbers in a line of it: arrays that begin with one take a quarter less time
 
 
@@ -82,9 +82,9 @@ class CartpoleSim:
         self._weights = 1 / 3, 2 / (3 * h), c.pole_length * 2 / (3 * h)
         # as arrays, which numpy takes as they are
         self._factors = tuple(map(np.array, self._scale)), np.array(self._weights)[:, None]
-        self._one = np.empty((3, 1))  # an angle, its sine and its cosine
-        self._of_one = tuple(map(torch.from_numpy, self._one))
-        self._scratch = _aligned(14, min(num_worlds, BLOCK)).numpy()
+        self._one = np.empty(3)  # an angle, its sine and its cosine
+        self._of_one = torch.from_numpy(self._one).split(1)
+        self._scratch = _aligned(14, min(num_worlds, BLOCK))
 
     @property
     def num_worlds(self) -> int:
@@ -104,17 +104,17 @@ class CartpoleSim:
 
     @property
     def device(self) -> torch.device:
-        return self._columns.device
+        return torch.device("cpu")
 
     @property
     def dtype(self) -> torch.dtype:
-        return self._columns.dtype
+        return torch.float64
 
     def x(self, ids: Ids = None) -> Tensor:
-        return fresh(self._of(ids)[:4], ids, 1).T
+        return self._copy(slice(0, 4), ids)
 
     def u(self, ids: Ids = None) -> Tensor:
-        return fresh(self._of(ids)[4:5], ids, 1).T
+        return self._copy(slice(4, 5), ids)
 
     def reset(self, x: Tensor, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, x=(x, self.nx), u=(u, self.nu))
@@ -122,20 +122,20 @@ class CartpoleSim:
 
     def step(self, u: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, u=(u, self.nu))
-        columns, force = self._of(ids).numpy(), u[:, 0].to(self.dtype).numpy()
+        columns, force, at = self._columns, u.to(self.dtype).numpy()[:, 0], self._where(ids)
         if len(force) == 1:  # a plan steps hundreds of worlds singly, for which arrays are slow
-            at = int(ids[0]) if isinstance(ids, Tensor) else (ids or slice(None)).indices(self.num_worlds)[0]
-            columns[:, at] = *self._after(columns[:4, at].tolist(), force.item(), self._sin_cos), force[0]
+            one = at.indices(self.num_worlds)[0] if isinstance(at, slice) else int(at[0])
+            columns[:, one] = *self._after(columns[:4, one].tolist(), force.item(), self._sin_cos), force[0]
             return
-        some = columns.take(ids.numpy(), 1) if isinstance(ids, Tensor) else columns[:, where(ids)]
+        some = columns[:, at] if isinstance(at, slice) else self._all.take(at, 1)
         parts = -(-len(force) // BLOCK)  # of one size: short ones take as many calls
         size = -(-len(force) // parts // LINE) * LINE if parts else 1
         for first in range(0, len(force), size):
             part = slice(first, first + size)
             self._move(some[:4, part], force[part])
         some[4] = force
-        if isinstance(ids, Tensor):
-            columns[:, ids.numpy()] = some
+        if not isinstance(at, slice):
+            columns[:, at] = some
 
     def _move(self, x: Floats, u: Floats) -> None:
         """Move states (4, n) one control step on under inputs (n,): `_after` in place, to the bit.
@@ -239,21 +239,30 @@ class CartpoleSim:
     def _sin_cos(self, angle: float) -> list[float]:
         """Sine and cosine of one angle, to the bit as of many."""
         one, sin, cos = self._of_one
-        self._one[0, 0] = angle
+        self._one[0] = angle
         torch.sin(one, out=sin)
         torch.cos(one, out=cos)
-        return self._one.ravel().tolist()[1:]
+        return self._one.tolist()[1:]
 
     def save(self, ids: Ids = None) -> Tensor:
-        return fresh(self._of(ids), ids, 1).T
+        return self._copy(slice(0, 5), ids)
 
     def load(self, rows: Tensor, ids: Ids = None) -> None:
         check(self.num_worlds, ids, rows=(rows, len(self._columns)))
-        self._columns[:, where(ids)] = rows.T
+        self._columns[:, self._where(ids)] = rows.numpy().T
 
-    def _of(self, ids: Ids) -> Tensor:
-        """The columns that have worlds: to pick out some of them takes little time where rows are whole."""
-        return self._all if isinstance(ids, Tensor) else self._columns
+    def _copy(self, what: slice, ids: Ids) -> Tensor:
+        """Some quantities of worlds `ids`, (n, number of quantities)."""
+        at = self._where(ids)
+        if isinstance(at, slice):
+            return torch.from_numpy(self._columns[what, at].copy()).T
+        return torch.from_numpy(self._all[what].take(at, 1)).T  # takes little time where rows are whole
+
+    def _where(self, ids: Ids) -> slice | NDArray[np.int64]:
+        """Which columns are of worlds `ids`."""
+        if isinstance(ids, Tensor):
+            return ids.numpy()
+        return slice(None) if ids is None else ids
 
     def energy(self, ids: Ids = None) -> Tensor:
         """Mechanical energy, zero at rest with the pole level [J], (n,)."""
@@ -265,6 +274,6 @@ class CartpoleSim:
         return kinetic + c.pole_mass * c.gravity * c.pole_length * theta.cos()
 
 
-def _aligned(rows: int, width: int) -> Tensor:
+def _aligned(rows: int, width: int) -> Floats:
     """Zeros, (rows, width or a little more): each row begins with a line of the cache."""
-    return torch.zeros(rows, -(-width // LINE) * LINE, dtype=torch.float64)
+    return torch.zeros(rows, -(-width // LINE) * LINE, dtype=torch.float64).numpy()

@@ -33,13 +33,11 @@ def blocks(ids: Tensor | slice, size: int) -> Tensor | slice:
     return (ids[:, None] * size + torch.arange(size, device=ids.device)).flatten()
 
 
-def fresh(buffer: Tensor, ids: Ids, dim: int = 0) -> Tensor:
-    """A copy of what `buffer` holds for worlds `ids`, which it has along `dim`, 0 or 1."""
+def fresh(buffer: Tensor, ids: Ids) -> Tensor:
+    """A copy of what `buffer` holds for worlds `ids`, a row a world."""
     if isinstance(ids, Tensor):
-        return buffer.index_select(dim, ids)
-    if ids is None:
-        return buffer.clone()
-    return (buffer[ids] if dim == 0 else buffer[:, ids]).clone()
+        return buffer.index_select(0, ids)
+    return buffer.clone() if ids is None else buffer[ids].clone()
 
 
 def joined(parts: Sequence[Tensor]) -> Tensor:

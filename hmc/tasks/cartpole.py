@@ -82,10 +82,10 @@ def cartpole(cfg: CartpoleCfg | None = None) -> Task:
 
 def _in_numpy(cfg: CartpoleCfg, x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor) -> Tensor:
     """The stage terms of `cartpole`, (n, 4): the same to the bit, in place."""
-    terms = torch.empty(4, len(x), dtype=x.dtype)
-    angle, position, velocity, effort = terms.numpy()
+    terms = np.empty((4, len(x)))
+    angle, position, velocity, effort = terms
     theta, p, theta_dot, p_dot = x.numpy().T
-    torch.cos(torch.from_numpy(theta), out=terms[0])
+    torch.cos(torch.from_numpy(theta), out=torch.from_numpy(angle))
     angle -= 1
     for rates, term in ((angle, angle), (p, position), (theta_dot, velocity), (p_dot, effort)):
         np.multiply(rates, rates, out=term)
@@ -95,7 +95,7 @@ def _in_numpy(cfg: CartpoleCfg, x: Tensor, u: Tensor, u_prev: Tensor, k: Tensor)
     weights = cfg.weight_angle, cfg.weight_position, cfg.weight_velocity, cfg.weight_input
     for term, weight in zip((angle, position, velocity, effort), weights, strict=True):
         term *= weight
-    return terms.T
+    return torch.from_numpy(terms).T
 
 
 def initial_state(cfg: CartpoleCfg | None = None) -> Tensor:

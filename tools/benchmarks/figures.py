@@ -32,6 +32,8 @@ AT_MOST = {
     "cartpole_converged_ms": 1000.0,
     "shared_fraction": 0.30,
     "pruned_fraction": 0.10,
+    "shared_time_fraction": 0.36,
+    "pruned_time_fraction": 0.12,
     "mppi_overhead": 1.10,
     "crc_us": 5.0,
     "exact_t75_ms": 250.0,
