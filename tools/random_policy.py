@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from hmc.go2.facts import COMMANDS, OBS_SIZE, contract
 from hmc.go2.stances import HOLDS
 
-HIDDEN = (256, 128, 64)
+HIDDEN = (512, 256, 128)
 
 
 def write_random_policy(

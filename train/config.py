@@ -60,7 +60,7 @@ class PpoCfg:
     final_std: float = 0.0
     settle: float = 0.5
     mirror: float = 0.0
-    hidden: tuple[int, ...] = (256, 128, 64)
+    hidden: tuple[int, ...] = (512, 256, 128)
     algorithm: str = "PPO"
 
 
