@@ -125,7 +125,8 @@ def test_an_update_is_kalmans_with_the_feet_it_takes(legs):
         H[at, PHI], H[at, R], H[at, foot(leg)] = -so3.skew(ekf.C @ s[leg]), np.eye(3), -np.eye(3)
         H[3 * len(legs) + k, foot(leg).stop - 1] = 1.0
     curved = 0.5 * (0.4 * (ekf.P[0, 0] + ekf.P[1, 1])) ** 2
-    noise = np.repeat([ekf.cfg.kinematics**2 + curved, ground], [3 * len(legs), len(legs)])
+    place = ekf.cfg.kinematics**2 + ekf.cfg.encoder**2  # a random filter sways
+    noise = np.repeat([place + curved, ground], [3 * len(legs), len(legs)])
     S = H @ ekf.P @ H.T + np.diag(noise)
     K = ekf.P @ H.T @ np.linalg.inv(S)
     other = plus(ekf, K @ e)
