@@ -10,8 +10,8 @@ from hmc.task import Task
 # Of what a device has free: drivers and allocators want some of it, and steps priced at once some 10 MiB.
 SHARE = 0.9
 # Bytes that a step works with for a world: copies of its row, what its mode and its cost come to on the way.
-# All that a policy of the Go2 and its cost ever make in a step is 13 KiB; other modes may take more.
-WORKING = 32 * 1024
+# All that a policy of the Go2 and its cost ever make in a step is 29 KiB; other modes may take more.
+WORKING = 64 * 1024
 
 
 def make_worlds(task: Task, wanted: int, room: float | None = None) -> Sim:

@@ -76,7 +76,7 @@ def test_what_was_given_up_is_free(monkeypatch):
 
 def test_not_even_one(monkeypatch):
     with pytest.raises(ValueError, match=r"the limit of the search is 0\.03 MiB: free some memory") as error:
-        plan(toy_task(HORIZON), X, room=FIXED + EACH - 40_000)
+        plan(toy_task(HORIZON), X, room=FIXED + EACH - 72_768)
     assert "\n" not in str(error.value)
     assert f"one schedule takes {(FIXED + EACH) / 2**20:.2f} MiB" in str(error.value)
     monkeypatch.setattr(memory, "free_memory", lambda device: 0.0)
