@@ -51,7 +51,7 @@ def test_a_factor_changes_one_thing(cfg):
 
 
 def test_a_run_has_more_to_choose_from_with_more_modes(cfg):
-    """Where nothing better is found, coverage is the draws of a tick, 2, over all M T (T + 1) / 2 switches."""
+    """Where nothing better is found, coverage is a tick's 2 draws over all M T (T + 1) / 2 switches."""
     three, five = (work(cfg, Job("modes", value, 11)) for value in (3, 5))
     assert (three.coverage, five.coverage) == pytest.approx((2 / 63, 2 / 105))
     assert math.isfinite(three.cost)
