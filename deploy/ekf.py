@@ -1,7 +1,8 @@
 r"""Error-state Kalman filter of a legged body: IMU in, feet on the ground as measurements.
 
 Base: M. Bloesch et al., "State estimation for legged robots: consistent fusion of leg kinematics and IMU",
-RSS 2012, with the rotation error taken in the world frame, feet that roll and creep, and the ground's height.
+RSS 2012, with the rotation error taken in the world frame, feet that roll and give way, and the ground's
+height.
 
 ========== ===== ======================================================== ============
 state      error meaning                                                  unit
@@ -11,8 +12,8 @@ v          3:6   velocity of the IMU in the world frame                   m/s
 r          6:9   position of the IMU in the world frame                   m
 b_w        9:12  bias of the gyroscope                                    rad/s
 b_f        12:15 bias of the accelerometer                                m/s^2
-p[0..3]    15:27 centres of the four foot spheres in the world frame      m
-c          27    creep of a loaded foot                                   m/s/N
+p[0..3]    15:27 centres of the foot spheres without load, world frame    m
+c          27    compliance of a foot and the ground under it             m/N
 l          28    how late the gyroscope reads                             s
 ========== ===== ======================================================== ============
 
@@ -21,16 +22,17 @@ estimate. With the gyroscope's reading w_m, the accelerometer's f_m, w = w_m - b
 
 .. math::
     \dot C = C [w + l \dot w], \quad \dot v = C f + g, \quad \dot r = v, \quad
-    \dot p_i = \rho \, (C w_i) \times e_z - c \, h_i
+    \dot p_i = \rho \, (C w_i) \times e_z
 
-where w_i is the angular velocity of shank i in the body frame, rho the radius of its foot, and h_i the
-horizontal force of the ground on it: a foot that rolls on level ground without slipping has its contact point
-at rest, not its centre; one that is pushed sideways creeps. How fast is found out, since the forces within a
-stance draw its feet apart or together; so is how late the gyroscope reads, by what a swing leaves. The
-measurement of a foot that stands, with s_i its centre by kinematics, seen from the IMU, is
+where w_i is the angular velocity of shank i in the body frame and rho the radius of its foot: a foot that
+rolls on level ground without slipping has its contact point at rest, not its centre. How late the gyroscope
+is, is found out by what a swing leaves. The measurement of a foot that stands, with s_i its centre by
+kinematics, seen from the IMU, and n_i the load that it has given way to, is
 
 .. math::
-    0 = C s_i + r - p_i
+    0 = C s_i + r + c \, n_i e_z - p_i
+
+The compliance is found out, too: the feet of a stance take the load in turns.
 
 Feet that do not stand are kept out: their covariance is 1 m^2, uncorrelated.
 """
@@ -52,13 +54,13 @@ Flags = NDArray[np.bool_]
 Rows = Sequence[Sequence[float]]
 N = 29
 PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
-FEET, CREEP, LATE = slice(15, 27), 27, 28
+FEET, GIVE, LATE = slice(15, 27), 27, 28
 GRAVITY = 9.81
 _ARM = 0.4  # m, from the IMU to a foot
 _TINY = 1e-12
 _I3 = np.eye(3)
 _UP = skew(np.array([0.0, 0.0, 1.0]))
-_NO_FORCE = _FIRM = _FELT = ((0.0, 0.0),) * 4
+_FIRM = ((0.0, 0.0),) * 4
 _STEADY = np.zeros(6)
 
 
@@ -91,10 +93,12 @@ class Ekf:
     Attributes:
         q: attitude (w, x, y, z), (4,); C its matrix, (3, 3).
         v, r, bw, bf, p: see the module; p is (4, 3).
-        creep, late: c and l of the module.
+        give, late: c and l of the module.
+        load: n of the module, 4 [N].
         P: covariance of the error, (29, 29).
         stands: which feet are anchored, (4,) bool.
-        sway: how much each leg sways, 0 to 1, 4 (`deploy.sway`).
+        sway, far: how much each leg sways, 0 to 1, and how far it has turned lately [rad], 4 each
+            (`deploy.sway`).
     """
 
     def __init__(self, cfg: NoiseCfg):
@@ -103,8 +107,11 @@ class Ekf:
         self.C = np.eye(3)
         self.v, self.r, self.bw, self.bf = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         self.p = np.zeros((4, 3))
-        self.creep = self.late = 0.0
-        self.stands, self.sway = np.zeros(4, dtype=bool), [1.0] * 4
+        self.give = self.late = 0.0
+        self.stands = np.zeros(4, dtype=bool)
+        self.load, self.sway, self.far = [0.0] * 4, [1.0] * 4, [0.0] * 4
+        # rotation of each shank since its foot touched down [rad], and the most of it, squared
+        self._turned = [(0.0, 0.0, 0.0, 0.0)] * 4
         self.P = np.eye(N)
         self._F, self._still = np.eye(N), np.eye(N)
         self._FP = np.empty((N, N))
@@ -112,13 +119,12 @@ class Ekf:
         self._legs: tuple[int, ...] = ()
         self._e, self._PHt, self._S = np.empty(0), np.empty(0), np.empty(0)
 
-    def transition(self, f: Array, roll: Rows, pull: Rows, change: Array, dt: float) -> Array:
+    def transition(self, f: Array, roll: Rows, change: Array, dt: float) -> Array:
         """Jacobian of the error after a step by the error before it, (29, 29), to first order in dt.
 
         Args:
             f: specific force without its bias, in the body frame [m/s^2], (3,).
             roll: rotation of each shank in the world frame over the step [rad], 4 of 3.
-            pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
             change: of the gyroscope's reading over the step [rad/s], (3,).
             dt: [s].
         """
@@ -144,8 +150,6 @@ class Ekf:
             F[at, 2], F[at + 1, 2] = FOOT_RADIUS * x, FOOT_RADIUS * y
             F[at : at + 2, BW] = lever
             F[at, LATE], F[at + 1, LATE] = lag_y, -lag_x
-            x, y = pull[leg]
-            F[at, CREEP], F[at + 1, CREEP] = -dt * x, -dt * y
         return F
 
     def predict(
@@ -156,9 +160,7 @@ class Ekf:
         dt: float,
         gap: float = 0.0,
         jump: Array | None = None,
-        pull: Rows = _NO_FORCE,
         loose: Rows = _FIRM,
-        unfelt: Rows = _FELT,
         change: Array = _STEADY,
     ) -> None:
         """Move on by dt.
@@ -170,28 +172,27 @@ class Ekf:
             gap: how much of dt no reading covers, or for how long none has come [s].
             jump: difference of the readings before and after the gap, gyroscope's then accelerometer's, (6,):
                 what lies between is known to about half of it.
-            pull: horizontal force of the ground on each foot in the world frame [N], 4 of 2.
             loose: what a foot's place walks beyond a standing foot's, variance per time [m^2/s], 4 of
                 (horizontal, vertical).
-            unfelt: `deploy.kinematics.Chain.unfelt` along the ground in the world frame, 4 of 2.
             change: of the readings since the last step, gyroscope's then accelerometer's, (6,).
         """
         w, f = gyro - self.bw, acc - self.bf
         phi = w * dt + self.late * change[:3]
         roll = (phi + turn) @ self.C.T
         rows = roll.tolist()
-        F = self.transition(f, rows, pull, change[:3], dt)
+        F = self.transition(f, rows, change[:3], dt)
         np.matmul(F, self.P, out=self._FP)
         P = np.matmul(self._FP, F.T)
         P += P.T
         P *= 0.5
         diagonal = P.reshape(-1)[:: N + 1]
-        diagonal += self._walk(w, f, rows, pull, dt, 0.5 * gap * dt, loose)
-        diagonal[V] += (self.cfg.sample * dt * (self.C @ change[3:])) ** 2  # along the shock, not across it
+        diagonal += self._walk(w, f, rows, dt, 0.5 * gap * dt, loose)
+        if (size := math.sqrt(float(change[3:] @ change[3:]))) > self.cfg.shock:  # along it, not across
+            doubt = self.cfg.sample * (1.0 - self.cfg.shock / size) * dt
+            diagonal[V] += (doubt * (self.C @ change[3:])) ** 2
         if jump is not None:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P
-        self._drift(unfelt, dt)
 
         first, second = so3.carried(phi, f)
         dv = self.C @ (dt * first)
@@ -202,49 +203,32 @@ class Ekf:
         self.v = self.v + dv
         for leg, stands in enumerate(self.stands.tolist()):
             if stands:
-                (x, y, _), (a, b), creep = rows[leg], pull[leg], self.creep * dt
-                self.p[leg, 0] += FOOT_RADIUS * y - creep * a
-                self.p[leg, 1] -= FOOT_RADIUS * x + creep * b
+                x, y, _ = rows[leg]
+                self.p[leg, 0] += FOOT_RADIUS * y
+                self.p[leg, 1] -= FOOT_RADIUS * x
         self.q, self.C = so3.turned(self.q, phi)
 
-    def _walk(
-        self, w: Array, f: Array, roll: Rows, pull: Rows, dt: float, hidden: float, loose: Rows
-    ) -> list[float]:
+    def _walk(self, w: Array, f: Array, roll: Rows, dt: float, hidden: float, loose: Rows) -> list[float]:
         """Diagonal of the step's noise, 29; `hidden` is the time [s^2] in which changes went unseen."""
         cfg = self.cfg
         shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
         hidden *= max(self.sway)
-        # noise of two readings is in their difference as well, where `predict` counts it once more
-        acc_white = cfg.acc**2 * (1.0 - 2.0 * cfg.sample**2)
-        speed = (acc_white + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
+        speed = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
         angle = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
         place, gyro, acc = speed * dt * dt / 3.0, cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
-        slide = (cfg.slide * self.creep) ** 2
         Q = [angle] * 3 + [speed] * 3 + [place] * 3 + [gyro] * 3 + [acc] * 3
         for leg, stands in enumerate(self.stands.tolist()):
             if not stands:
                 Q += (0.0, 0.0, 0.0)
                 continue
-            (x, y, z), (across, down), (a, b) = roll[leg], loose[leg], pull[leg]
-            walk = cfg.firm**2 + (cfg.foot * self.sway[leg]) ** 2
-            across += slide * (a * a + b * b)
-            foot = walk * dt + cfg.roll**2 * math.sqrt(x * x + y * y + z * z)
+            (dx, dy, dz), (across, down), (x, y, z, most) = roll[leg], loose[leg], self._turned[leg]
+            x, y, z = x + dx, y + dy, z + dz
+            turned = max(most, x * x + y * y + z * z)
+            self._turned[leg] = x, y, z, turned
+            foot = cfg.foot**2 * dt + cfg.bend**2 * (turned - most)
             Q += (foot + across * dt, foot + across * dt, foot + down * dt)
-        Q += (cfg.creep_walk**2 * dt, 0.0)
+        Q += (cfg.give_walk**2 * dt, 0.0)
         return Q
-
-    def _drift(self, unfelt: Rows, dt: float) -> None:
-        """Widen P by what feet creep with forces that the torques do not tell, each along a line."""
-        creep = self.creep**2 + float(self.P[CREEP, CREEP])
-        walk = self.cfg.across**2 * creep * dt
-        for leg, stands in enumerate(self.stands.tolist()):
-            if stands:
-                x, y = unfelt[leg]
-                at = foot(leg).start
-                self.P[at, at] += walk * x * x
-                self.P[at, at + 1] += walk * x * y
-                self.P[at + 1, at] += walk * x * y
-                self.P[at + 1, at + 1] += walk * y * y
 
     def anchor(self, leg: int, s: Array) -> None:
         """A foot touches down: its position becomes what kinematics say.
@@ -254,15 +238,18 @@ class Ekf:
             s: foot centre from the IMU in the body frame [m], (3,).
         """
         self.release(leg)
-        arm = self.C @ s
+        arm, load = self.C @ s, self.load[leg]
         self.p[leg] = self.r + arm
-        # error of p: that of r, and phi x C s
+        self.p[leg, 2] += self.give * load
+        # error of p: that of r, phi x C s, and what the load makes of the compliance
         rows = self.P[R] - skew(arm) @ self.P[PHI]
+        rows[2] += load * self.P[GIVE]
         at, P = foot(leg), self.P
         P[at], P[:, at] = rows, rows.T
         block = rows[:, R] - rows[:, PHI] @ skew(arm).T
+        block[:, 2] += load * rows[:, GIVE]
         P[at, at] = 0.5 * (block + block.T) + self._place_variance(leg) * _I3
-        self.stands[leg] = True
+        self.stands[leg], self._turned[leg] = True, (0.0, 0.0, 0.0, 0.0)
 
     def _place_variance(self, leg: int) -> float:
         """Of a foot's place by kinematics, along an axis [m^2].
@@ -270,7 +257,9 @@ class Ekf:
         What is of second order in the tilt's error, (1/2) phi^2 s, would pass for knowledge of it.
         """
         tilt = float(self.P[0, 0] + self.P[1, 1])
-        place = self.cfg.encoder**2 + (self.cfg.kinematics * self.sway[leg]) ** 2
+        cfg = self.cfg
+        sways = (cfg.kinematics * self.sway[leg]) ** 2 + (cfg.swing * self.far[leg]) ** 2
+        place = cfg.encoder**2 + sways
         return place + 0.5 * (_ARM * tilt) ** 2
 
     def release(self, leg: int) -> None:
@@ -295,8 +284,9 @@ class Ekf:
         C, r, p = self.C.tolist(), self.r.tolist(), self.p.tolist()
         for k, leg in enumerate(legs):
             x, y, z = so3.rotated(C, s[leg])
-            q = p[leg]
-            e += (q[0] - r[0] - x, q[1] - r[1] - y, q[2] - r[2] - z)
+            q, load = p[leg], self.load[leg]
+            e += (q[0] - r[0] - x, q[1] - r[1] - y, q[2] - r[2] - z - self.give * load)
+            H[3 * k + 2, GIVE] = load
             H[3 * k, 1], H[3 * k, 2], H[3 * k + 1, 0] = z, -y, -z
             H[3 * k + 1, 2], H[3 * k + 2, 0], H[3 * k + 2, 1] = x, y, -x
         e += [FOOT_RADIUS - p[leg][2] for leg in legs]
@@ -368,5 +358,5 @@ class Ekf:
         self.v, self.r = self.v + d[V], self.r + d[R]
         self.bw, self.bf = self.bw + d[BW], self.bf + d[BF]
         self.p += d[FEET].reshape(4, 3)
-        self.creep += float(d[CREEP])
+        self.give += float(d[GIVE])
         self.late += float(d[LATE])

@@ -9,8 +9,9 @@ import numpy as np
 
 from deploy import so3
 from deploy.contact import ContactCfg, Fall, FallCfg, FootContact
-from deploy.ekf import BF, BW, CREEP, GRAVITY, LATE, PHI, Ekf, Flags, R, V, distance
+from deploy.ekf import BF, BW, GIVE, GRAVITY, LATE, PHI, Ekf, Flags, R, V, distance
 from deploy.estimate import Estimate
+from deploy.footing import Footing, FootingCfg
 from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, lowest
 from deploy.noise import NoiseCfg
 from deploy.so3 import Array
@@ -33,6 +34,7 @@ class EstimatorCfg:
     Attributes:
         noise: standard deviations.
         contact: contact detection.
+        footing: how feet with contact move.
         start: the stand at the start.
         fall: when the estimate counts as lost.
         flat: whether all footholds are at height 0, which keeps the height from drifting.
@@ -41,12 +43,8 @@ class EstimatorCfg:
         gate: squared Mahalanobis distance beyond which a foot's place is an outlier; chi-square with 3
             degrees of freedom passes 99.9 % at 16.3.
         slip_gate: the same for the speed of a foot's contact point.
-        creep: speed at which the contact point of a standing foot may move, standard deviation [m/s].
+        slip: speed at which the contact point of a standing foot may move, standard deviation [m/s].
         joint_speed: standard deviation of a reading [rad/s].
-        settle: horizontal speed that a foot has left when it begins to count as standing, likewise [m/s].
-        settle_time: in which it goes down to 1/e [s].
-        bounce: vertical speed with which a foot comes back out of ground that it has hit, of that of the hit.
-        bounce_time: in which it goes down to 1/e [s].
         patience: a foot left out for longer loses its anchor [s].
         lost: when all feet with contact are left out for this long, the velocity counts as lost [s].
         lost_speed: standard deviation added to it then [m/s].
@@ -58,6 +56,7 @@ class EstimatorCfg:
 
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     contact: ContactCfg = field(default_factory=ContactCfg)
+    footing: FootingCfg = field(default_factory=FootingCfg)
     start: StartCfg = field(default_factory=StartCfg)
     fall: FallCfg = field(default_factory=FallCfg)
     flat: bool = True
@@ -65,12 +64,8 @@ class EstimatorCfg:
     max_gap: float = 0.5
     gate: float = 16.3
     slip_gate: float = 16.3
-    creep: float = 0.035
+    slip: float = 0.035
     joint_speed: float = 0.05
-    settle: float = 0.1
-    settle_time: float = 0.01
-    bounce: float = 0.2
-    bounce_time: float = 0.025
     patience: float = 0.01
     lost: float = 0.05
     lost_speed: float = 0.5
@@ -114,10 +109,7 @@ class Estimator:
         self._q, self._qd = [math.nan] * 12, [0.0] * 12
         self._refused = [0.0] * 4  # for how long each foot has been left out [s]
         self._lost = self._calm = 0.0
-        self._pull = [(0.0, 0.0)] * 4  # horizontal force on each foot with contact [N]
-        self._unfelt = [(0.0, 0.0)] * 4  # what the torques do not tell of it
-        # variance of the speed of each foot since it touched down, horizontal and vertical [m^2/s^2]
-        self._moves = [(0.0, 0.0)] * 4
+        self._footing = [Footing(self.cfg.footing) for _ in range(4)]
         self._fall, self._ticks, self._lowest = Fall(self.cfg.fall), 0, 0.0
         self._ready = False
         self._estimate: Estimate | None = None
@@ -147,7 +139,7 @@ class Estimator:
             self._imu, self._good, blind = np.concatenate([gyro, acc]), t, blind - self.cfg.period
         known, turned = self._joints(q.tolist(), qd.tolist())
         self._sway.update(turned, (self._imu[:3] - self.ekf.bw).tolist(), dt)
-        self.ekf.sway = self._sway.legs
+        self.ekf.sway, self.ekf.far = self._sway.legs, self._sway.far
         if not self._ready:
             self._begin(good, force.tolist(), dt)
             return self._estimate
@@ -159,8 +151,9 @@ class Estimator:
             jump = imu - last
             imu = imu - 0.5 * min(1.0, blind / dt) * jump
         turns = [chain.shank(*turned[3 * i : 3 * i + 3]) for i, chain in enumerate(leg)]
-        gap, loose = max(0.0, blind), self._loose(dt)
-        self.ekf.predict(imu[:3], imu[3:], turns, dt, gap, jump, self._pull, loose, self._unfelt, change)
+        gap, give = max(0.0, blind), self.ekf.give**2 + float(self.ekf.P[GIVE, GIVE])
+        loose = [footing.loose(give, dt) for footing in self._footing]
+        self.ekf.predict(imu[:3], imu[3:], turns, dt, gap, jump, loose, change)
         if not (good or self._carried) and math.isfinite(float(acc.sum())):
             # a blow beyond the accelerometer's range, and no feet to tell what it did to the velocity
             self.ekf.P[V, V] += (2.0 * self.cfg.max_acc * dt) ** 2 * _I3
@@ -239,7 +232,7 @@ class Estimator:
         variance[PHI], variance[V] = (1.0, 1.0, 1e-8), stood.velocity_error**2
         variance[R] = 1e-8, 1e-8, noise.ground**2 if foot else _LYING**2
         variance[BW], variance[BF] = noise.gyro_bias**2, noise.acc_bias**2
-        variance[CREEP], variance[LATE] = noise.creep**2, noise.late**2
+        variance[GIVE], variance[LATE] = noise.give**2, noise.late**2
         ekf.P = np.diag(variance)
         ekf.observe_rate(stood.rate, stood.rate_variance)
         ekf.observe_force(stood.force, np.full(3, stood.force_error**2))
@@ -251,17 +244,22 @@ class Estimator:
         """Tell contacts, use feet, anchor and release them; which were used, (4,) bool."""
         cfg, ekf = self.cfg, self.ekf
         C, contact, still = ekf.C.tolist(), [False] * 4, [False] * 4
+        load = [so3.rotated(C, chain.force(*tau[3 * i : 3 * i + 3]))[2] for i, chain in enumerate(leg)]
         for i, chain in enumerate(leg):
-            x, y, z = so3.rotated(C, chain.force(*tau[3 * i : 3 * i + 3]))
-            contact[i] = self.detectors[i].update(force[i], z, dt)
+            contact[i] = self.detectors[i].update(force[i], load[i], dt)
             if not contact[i]:
+                load[i] = 0.0
                 continue
-            self._pull[i] = (x, y) if math.isfinite(x + y) else (0.0, 0.0)
-            self._unfelt[i] = so3.rotated(C, chain.unfelt)[:2]
-            u = self._slip(i, chain, C)
+            u, footing = self._slip(i, chain, C), self._footing[i]
             if not self.contact[i]:
-                self._moves[i] = cfg.settle**2, (cfg.bounce * min(u[2], 0.0)) ** 2
+                footing.touch_down(u[2])
+            doubt = float(ekf.P[3, 3] + ekf.P[4, 4])
+            footing.slide(u[0], u[1], doubt, (cfg.joint_speed * _ARM) ** 2, dt)
             still[i] = known[i] and self._rests(i, u)
+        mean = sum(load) / max(sum(contact), 1)
+        for i, footing in enumerate(self._footing):
+            footing.bear(load[i], mean, dt)
+            ekf.load[i] = footing.load
 
         stands, used = ekf.stands.tolist(), np.zeros(4, dtype=bool)
         s = [(x - _IMU[0], y - _IMU[1], z - _IMU[2]) for x, y, z in (chain.foot for chain in leg)]
@@ -295,17 +293,10 @@ class Estimator:
         self.contact = np.array(contact)
         return used
 
-    def _loose(self, dt: float) -> list[tuple[float, float]]:
-        """What the feet walk since they touched down: they slide, sink in and come back [m^2/s]."""
-        cfg = self.cfg
-        slower = math.exp(-2.0 * dt / cfg.settle_time), math.exp(-2.0 * dt / cfg.bounce_time)
-        self._moves = [(across * slower[0], down * slower[1]) for across, down in self._moves]
-        return [(across * cfg.settle_time, down * cfg.bounce_time) for across, down in self._moves]
-
     def _slip(self, i: int, chain: Chain, C: list[list[float]]) -> Vector:
         r"""Velocity of a foot's contact point in the world frame [m/s].
 
-        .. math:: u_i = v + C (w \times s_i + J_i \dot q_i) - \rho \, (C w_i) \times e_z + c \, h_i
+        .. math:: u_i = v + C (w \times s_i + J_i \dot q_i) - \rho \, (C w_i) \times e_z
         """
         ekf, (a, b, c) = self.ekf, self._qd[3 * i : 3 * i + 3]
         p, q, r = (self._imu[:3] - ekf.bw).tolist()
@@ -323,21 +314,15 @@ class Estimator:
         d, e, f = chain.shank(a, b, c)
         d, e, _ = so3.rotated(C, (p + d, q + e, r + f))
         vx, vy, vz = ekf.v.tolist()
-        x, y = self._pull[i]
-        return (
-            vx + foot[0] - FOOT_RADIUS * e + ekf.creep * x,
-            vy + foot[1] + FOOT_RADIUS * d + ekf.creep * y,
-            vz + foot[2],
-        )
+        return vx + foot[0] - FOOT_RADIUS * e, vy + foot[1] + FOOT_RADIUS * d, vz + foot[2]
 
     def _rests(self, i: int, u: Vector) -> bool:
         """Whether the contact point of a foot with contact rests, by its velocity u [m/s]."""
-        cfg, P, (x, y) = self.cfg, self.ekf.P, self._pull[i]
-        A, doubt = P[V, V].tolist(), float(P[CREEP, CREEP])
-        noise = cfg.creep**2 + (cfg.joint_speed * _ARM) ** 2
-        A[0][0] += noise + doubt * x * x
-        A[1][1] += noise + doubt * y * y
-        A[2][2] += noise + self._moves[i][1]
+        cfg, A = self.cfg, self.ekf.P[V, V].tolist()
+        noise = cfg.slip**2 + (cfg.joint_speed * _ARM) ** 2
+        A[0][0] += noise
+        A[1][1] += noise
+        A[2][2] += noise + self._footing[i].bounces
         return distance(A, u) < cfg.slip_gate
 
     def _output(self, used: Flags) -> Estimate:

@@ -70,17 +70,6 @@ class Chain:
         across = -(hip + self.out * up) * d / (d * d + _LEVEL * _LEVEL)
         return ahead, cos * across - sin * up, sin * across + cos * up
 
-    @property
-    def unfelt(self) -> Vector:
-        """Direction in the base frame in which `force` is damped, as long as the share that stays unknown.
-
-        No force across the leg turns the hip where the foot is under its axis. With a force of deviation F
-        and a torque off by l F, damping by l is the best guess; it leaves a deviation F l / sqrt(d^2 + l^2).
-        """
-        cos, sin = self.hip
-        share = _LEVEL / math.hypot(self.thigh[1], _LEVEL)
-        return 0.0, share * cos, share * sin
-
 
 @dataclass(frozen=True, slots=True)
 class Legs:

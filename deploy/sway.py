@@ -23,12 +23,13 @@ class Sway:
 
     Attributes:
         legs: how much each leg sways, 0 to 1, 4.
+        far: how far each leg, or the body, has turned lately [rad], 4.
     """
 
     def __init__(self, cfg: NoiseCfg, period: float):
         self._cfg, self._period = cfg, period
         self._turned = [0.0] * 15  # joints and body [rad]
-        self.legs = [1.0] * 4
+        self.legs, self.far = [1.0] * 4, [0.0] * 4
 
     def update(self, turned: Sequence[float], rate: Sequence[float], dt: float) -> None:
         """Take a step; one without numbers, as the first is, tells nothing.
@@ -49,4 +50,5 @@ class Sway:
         for i in range(4):
             joints = s[3 * i : 3 * i + 3]
             far = max(high, -low, max(joints), -min(joints))
+            self.far[i] = max(far, fade * self.far[i])
             self.legs[i] = max(min(1.0, (far / cfg.sway) ** 2), fade * self.legs[i])

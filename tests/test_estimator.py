@@ -313,15 +313,16 @@ def test_without_flat_ground_the_height_is_free():
 
 @pytest.mark.parametrize(
     ("motion", "seconds", "speed", "seeds"),
-    # the robot of seed 1001 stands for half a second with a foot under its hip's axis
+    # in the long one the feet of seed 1002 slide before they lift off, and give way by turns, a hundred times
     [
-        ("footstand", 2.0, 0.02, [7]),
-        ("footstand", 4.0, 0.02, [1001]),
-        ("handstand", 2.0, 0.02, [7]),
-        ("flip", 3.0, 0.03, [7, 8]),
+        ("footstand", 2.0, 0.01, [7]),
+        ("footstand", 4.0, 0.01, [1001]),
+        ("handstand", 2.0, 0.01, [7]),
+        ("handstand", 20.0, 0.006, [1002]),
+        ("flip", 3.0, 0.02, [7, 8]),
     ],
 )
-def test_short_logs(motion, seconds, speed, seeds):
+def test_logs(motion, seconds, speed, seeds):
     assert np.mean([judged(motion, seconds, speed, seed) for seed in seeds]) < 0.01
 
 

@@ -51,6 +51,15 @@ def test_a_gap_is_no_stillness_and_a_step_without_numbers_tells_nothing():
         assert sway.legs == before
 
 
+def test_how_far_a_leg_has_turned_is_remembered_for_a_while():
+    cfg = NoiseCfg()
+    sway = Sway(cfg, DT)
+    sway.update([0.0] * 4 + [0.3] + [0.0] * 7, LEVEL, DT)
+    assert sway.far == pytest.approx([0.0, 0.3, 0.0, 0.0])
+    rest(sway, cfg.calm_time)
+    assert sway.far == pytest.approx([0.0, 0.3 * math.exp(-1.0), 0.0, 0.0], rel=0.01)
+
+
 def test_noise_of_the_gyroscope_and_steps_of_the_encoders_are_no_sway():
     cfg, rng = NoiseCfg(), np.random.default_rng(0)
     sway, step = Sway(cfg, DT), 2.0 * math.pi / 2**15

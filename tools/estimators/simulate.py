@@ -20,6 +20,7 @@ from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import flip_task, policy_path
 from hmc.modes import Mode
 from tools.closed_loop import RunCfg, disturbed_start
+from tools.robot.body import stick
 
 ROOT = Path(__file__).resolve().parents[2]
 Array = NDArray[np.float64]
@@ -34,10 +35,12 @@ class BodyCfg:
     Attributes:
         link: lengths of thighs and shanks, lateral offset of the legs [m].
         friction: of the feet, least and most.
+        impratio: `tools.robot.body.stick`.
     """
 
     link: float = 0.002
     friction: tuple[float, float] = (0.4, 1.0)
+    impratio: float = 100.0
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ def robot(cfg: BodyCfg, rng: np.random.Generator) -> mujoco.MjModel:
     """The Go2 with an IMU, its links and friction off by draws from `rng`."""
     spec = mujoco.MjSpec.from_file(str(resources.files("hmc.go2") / "go2.xml"))
     spec.option.timestep = PHYSICS
+    stick(spec, cfg.impratio)
     for name, kind in (("gyro", "GYRO"), ("acc", "ACCELEROMETER")):
         kind = getattr(mujoco.mjtSensor, f"mjSENS_{kind}")
         spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
