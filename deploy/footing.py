@@ -29,10 +29,10 @@ class FootingCfg:
     bounce_time: float = 0.025
     slide_time: float = 0.004
     slide_gate: float = 2.0
-    light: float = 0.1
-    light_share: float = 0.7
+    light: float = 0.2
+    light_share: float = 0.5
     give_time: float = 0.0125
-    give_share: float = 0.7
+    give_share: float = 0.6
 
 
 class Footing:

@@ -46,21 +46,21 @@ class NoiseCfg:
     """
 
     gyro: float = 0.01
-    acc: float = 0.1
+    acc: float = 0.093
     scale: float = 0.005
     sample: float = 0.15
-    shock: float = 8.0
+    shock: float = 5.0
     gyro_walk: float = 1.5e-4
     acc_walk: float = 1.5e-3
     gyro_bias: float = 0.003
     acc_bias: float = 0.03
     turn: float = 10.0
     jerk: float = 20.0
-    foot: float = 0.000065
+    foot: float = 0.00004
     bend: float = 0.002
     late: float = 1e-3
-    kinematics: float = 0.0003
-    swing: float = 0.004
+    kinematics: float = 0.00025
+    swing: float = 0.0045
     encoder: float = 0.00002
     give: float = 2e-5
     give_walk: float = 1e-6
