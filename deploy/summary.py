@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from deploy.control import TICK
-from deploy.ekf import R
+from deploy.ekf import R, V
 from deploy.log import read
 from deploy.modes import HAND, NAMES, NONE
 from deploy.safety import Phase
+from deploy.so3 import matrix
 from hmc.go2.model import DT
 from hmc.go2.stages import judge
 
@@ -85,20 +86,34 @@ def _true(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, bool] | None:
 def accuracy(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, float] | None:
     """How far the estimate was from the truth at the ticks of the hybrid phase; None where there are none.
 
-    Velocity [m/s] in the world frame, height [m]; `height_sigmas_max` is in standard deviations.
+    Velocity in the body frame [m/s], as a heading cannot be known; height [m]; tilt, the error of gravity's
+    direction [deg]. `sigmas`: in standard deviations, of velocity and tilt the root mean square over axes and
+    ticks, 1 where the covariance is right.
     """
     known, x = _meet(path, hybrid)
     if not known:
         return None
-    estimate = np.array([tick["x"] for tick in known])
-    sigma = np.sqrt([tick["variance"][R.start + 2] for tick in known])
+    estimate, variance = (np.array([tick[name] for tick in known]) for name in ("x", "variance"))
+    told, true = (np.array([matrix(q) for q in each[:, 3:7]]) for each in (estimate, x))
     height = np.abs(estimate[:, 2] - x[:, 2])
-    speed = np.linalg.norm(estimate[:, 19:22] - x[:, 19:22], axis=1)
+    body = np.einsum("nij,ni->nj", told, estimate[:, 19:22]) - np.einsum("nij,ni->nj", true, x[:, 19:22])
+    # in the world that the estimate has, as the variances are; world z by the true attitude is z - phi x z
+    velocity, up = np.einsum("nij,nj->ni", told, body), np.einsum("nij,nj->ni", told, true[:, 2])
+    tilt = up[:, :2]
+
+    def sigmas(error: np.ndarray, of: slice) -> float:
+        return round(float(np.sqrt(np.mean(error**2 / np.maximum(variance[:, of], 1e-12)))), 2)
+
     return {
-        "velocity_rms": round(float(np.sqrt(np.mean(speed**2))), 4),
+        "velocity_rms": round(float(np.sqrt(np.mean(np.sum(velocity**2, 1)))), 4),
+        "velocity_sigmas": sigmas(velocity, V),
+        "tilt_rms": round(float(np.degrees(np.sqrt(np.mean(np.sum(tilt**2, 1))))), 3),
+        "tilt_sigmas": sigmas(tilt[:, ::-1], slice(0, 2)),
         "height_max": round(float(height.max()), 4),
         "height_last": round(float(height[-1]), 4),
-        "height_sigmas_max": round(float((height / np.maximum(sigma, 1e-6)).max()), 2),
+        "height_sigmas_max": round(
+            float((height / np.sqrt(np.maximum(variance[:, R.stop - 1], 1e-12))).max()), 2
+        ),
     }
 
 

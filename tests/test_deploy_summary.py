@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any
 
 import numpy as np
 import pytest
 
-from deploy import memory, timing
-from deploy.ekf import N, R
+from deploy import memory, so3, timing
+from deploy.ekf import N, R, V
 from deploy.memory import Memory
 from deploy.summary import accuracy
 from deploy.timing import Stolen
@@ -36,22 +37,35 @@ def test_memory_is_looked_at_once_it_is_warm(monkeypatch):
     assert kept.any()
 
 
-def test_the_estimate_against_the_truth(tmp_path):
-    """Velocity off by (0.03, 0.04, 0), height by 2 cm at the end, where it is sure to 1 cm."""
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_the_estimate_against_the_truth(tmp_path, heading):
+    """Off by (0.3, 0.4, 0) m/s and 10 mrad about x, by 2 cm at the end; sure to 0.1, 0.005, and 1 cm.
+
+    The estimate's world may be turned about the vertical: nobody can know its heading.
+    """
     x = np.tile(FOOTSTAND.state().numpy(), (4, 1))
     np.savez(tmp_path / "truth.npz", tick=[20, 40, 60, 80], qpos=x[:, :19], qvel=x[:, 19:])
+    lean, turn = so3.quaternion(np.array([0.01, 0.0, 0.0])), so3.quaternion(np.array([0.0, 0.0, heading]))
     ticks: list[dict[str, Any]] = []
     for i in range(4):
-        told, variance = x[i].copy(), np.full(N, 0.1)
-        told[19:21] += (0.03, 0.04)
+        told, variance = x[i].copy(), np.full(N, 7.0)
+        told[3:7] = so3.multiply(turn, so3.multiply(lean, told[3:7]))
+        told[19:22] = so3.matrix(turn) @ (told[19:22] + np.array([0.3, 0.4, 0.0]))
         told[2] += 0.02 if i == 3 else -0.001
-        variance[R] = (9.0, 9.0, 1e-4)
+        variance[:2], variance[V], variance[R] = 0.005**2, 0.01, (9.0, 9.0, 1e-4)
         ticks.append({"ms": 20 * (i + 1), "x": told.tolist(), "variance": variance.tolist()})
     ticks.append({**ticks[0], "ms": 999})  # whose truth is not known
     found = accuracy(tmp_path / "truth.npz", ticks)
-    assert found == pytest.approx(
-        {"velocity_rms": 0.05, "height_max": 0.02, "height_last": 0.02, "height_sigmas_max": 2.0}
-    )
+    expected = {
+        "velocity_rms": 0.5,
+        "velocity_sigmas": math.sqrt((3.0**2 + 4.0**2) / 3.0),
+        "tilt_rms": math.degrees(0.01),
+        "tilt_sigmas": math.sqrt(2.0**2 / 2.0),
+        "height_max": 0.02,
+        "height_last": 0.02,
+        "height_sigmas_max": 2.0,
+    }
+    assert found == pytest.approx(expected, abs=0.006)
     assert accuracy(tmp_path / "truth.npz", ticks[4:]) is None
 
 
