@@ -36,6 +36,7 @@ METADATA = "hmc"
 STATE, COMMAND, TICK_RECORD, PLAN, EVENT = range(5)
 TOPICS = ("rt/lowstate", "rt/lowcmd", "tick", "plan", "event")
 PIPE = 1 << 20  # octets
+CHUNK = 1 << 22  # octets, 6 s: the writer keeps an entry a chunk until the end, 1.4 KB each
 
 # A control step; see deploy.estimate.Estimate for x and the error's order in variance.
 TICK = np.dtype(
@@ -111,7 +112,7 @@ def write(source: BinaryIO, path: Path, about: dict[str, str]) -> None:
         about: goes into the file's metadata.
     """
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, chunk_size=CHUNK)
         writer.start(library="hmc")
         writer.add_metadata(METADATA, {"version": VERSION, **about})
         schema = json.dumps({"type": "object"}).encode()

@@ -131,9 +131,12 @@ class Loop:
         if command is not None and command != self._logged:
             self._recorder.add(COMMAND, command)
             self._logged = command
+        # what follows is never before a command, and one of it at a time
         if ticked:
             self._tell(now, left)
-        elif now - self._company > 1.0:  # takes as long as a tick does: never before a command
+        elif board.plan.count != self._plans:
+            self._take()
+        elif now - self._company > 1.0:  # takes as long as a tick does
             self._company = now
             self._look_around()
         if control.phase != self._phase or control.machine.hint != self._hint:
@@ -142,7 +145,7 @@ class Loop:
             self._recorder.event("phase", phase=self._phase.name.lower(), k=control.k, reason=why)
 
     def _listen(self, now: float) -> None:
-        """Read what the watchdog and the planner have to say."""
+        """Read what the watchdog has to say, and whether a planner is there."""
         control, board = self._control, self._board
         guard = board.guard.read()
         if guard is not None and guard["latched"] and not self._silent:
@@ -152,11 +155,6 @@ class Loop:
             control.wait = "the watchdog has not started yet" if guard is None else ""
             if guard is not None and now - float(guard["t"]) > control.cfg.watchdog.lost:
                 control.fail("the watchdog does not live any more")
-        if board.plan.count != self._plans:
-            self._plans = board.plan.count
-            record = board.plan.read()
-            if record is not None and record["number"] > 0:
-                self._take(record)
         told = board.plan.read() if control.phase == Phase.READY else None
         control.planner = told is not None and now - float(told["t"]) < _PRESENCE
 
@@ -167,8 +165,12 @@ class Loop:
         if others := self._link.rivals("rt/lowcmd", ours):
             self._control.fail(f"another program commands the motors: {others[0]}")
 
-    def _take(self, record: np.ndarray) -> None:
+    def _take(self) -> None:
         """A plan has come."""
+        self._plans = self._board.plan.count
+        record = self._board.plan.read()
+        if record is None or record["number"] <= 0:
+            return
         try:
             plan = Plan.read(record)
         except ValueError as error:
