@@ -121,7 +121,7 @@ class _Rollout:
         self.constant = task.modes.constants is not None
         self.rows = MANY_ROWS if self.cheap or self.later else ROWS
         # what steps cost can wait where nothing is given up for it
-        patient = self.patient = self.limit == math.inf and not self.later
+        patient = self.limit == math.inf and not self.later
         self.at_once = 1 if self.watchful and not self.later else self.rows if patient else STEPS
         # what is beyond its limit has no children, where to find out takes less time than to step those
         self.before_births = not (self.cheap or self.later or patient)
@@ -302,8 +302,6 @@ class _Rollout:
         """Add what the last steps cost, and end the branches that are beyond their limit, no number, or not
         `sane` (n,); the `rows`, (n E, ...) each, of the others."""
         self.account.settle(costs)
-        if self.patient and sane is None:  # a cost that is no number is one at the end, too
-            return rows
         total = total_by_term(self.sums)
         partial = self._risk(total)
         if sane is not None or not math.isfinite(total.sum()) or partial.max() > self.limit:
