@@ -9,9 +9,9 @@ from dataclasses import dataclass
 class NoiseCfg:
     """Standard deviations, all of them of one axis.
 
-    Those of readings are the simulated sensors', the accelerometer's a little less. Walks of the biases are half
-    as large again as theirs. These and those of the feet were chosen so that the errors are as large as the
-    filter says (docs/estimator.md).
+    Those of readings are the simulated sensors', the accelerometer's a little less; walks of the biases are
+    half as large again as theirs. These and those of the feet were chosen so that the errors are as large as
+    the filter says (docs/estimator.md).
 
     Attributes:
         gyro: of a reading [rad/s].
