@@ -52,11 +52,8 @@ class Footing:
     def touch_down(self, speed: float) -> None:
         """It begins to carry, at a vertical speed [m/s]."""
         cfg = self._cfg
-        self._settles, self.bounces, self._mean = (
-            cfg.settle**2,
-            (cfg.bounce * min(speed, 0.0)) ** 2,
-            (0.0, 0.0),
-        )
+        self._settles, self._mean = cfg.settle**2, (0.0, 0.0)
+        self.bounces = (cfg.bounce * min(speed, 0.0)) ** 2
 
     def bear(self, load: float, mean: float, dt: float) -> None:
         """It bears a load, all feet that carry bear so much on average [N]; a load of NaN tells nothing."""
