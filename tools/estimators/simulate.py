@@ -35,12 +35,10 @@ class BodyCfg:
     Attributes:
         link: lengths of thighs and shanks, lateral offset of the legs [m].
         friction: of the feet, least and most.
-        impratio: `tools.robot.body.stick`.
     """
 
     link: float = 0.002
     friction: tuple[float, float] = (0.4, 1.0)
-    impratio: float = 100.0
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def robot(cfg: BodyCfg, rng: np.random.Generator) -> mujoco.MjModel:
     """The Go2 with an IMU, its links and friction off by draws from `rng`."""
     spec = mujoco.MjSpec.from_file(str(resources.files("hmc.go2") / "go2.xml"))
     spec.option.timestep = PHYSICS
-    stick(spec, cfg.impratio)
+    stick(spec)
     for name, kind in (("gyro", "GYRO"), ("acc", "ACCELEROMETER")):
         kind = getattr(mujoco.mjtSensor, f"mjSENS_{kind}")
         spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")

@@ -24,26 +24,26 @@ class Body:
         length: of each leg's hip, thigh and shank, and of the IMU's place [m].
         zero: of each joint's encoder [rad].
         friction: range of the feet's sliding friction; None for the model's.
-        impratio: `stick`; None for the model's contacts.
+        sticks: whether its feet `stick`, or have the model's contacts.
     """
 
     mass: float = 0.05
     length: float = 0.002
     zero: float = math.radians(0.5)
     friction: tuple[float, float] | None = (0.5, 1.0)
-    impratio: float | None = 100.0
+    sticks: bool = True
 
 
-EXACT = Body(mass=0.0, length=0.0, zero=0.0, friction=None, impratio=None)
+EXACT = Body(mass=0.0, length=0.0, zero=0.0, friction=None, sticks=False)
 
 
-def stick(spec: mujoco.MjSpec, impratio: float) -> None:
-    """Feet that stick to the ground: friction as stiff as what bears the weight times this.
+def stick(spec: mujoco.MjSpec) -> None:
+    """Feet that stick to the ground: friction 100 times as stiff as what bears the weight.
 
     The planner's pyramids are quicker, but let feet creep by 1 mm/s a newton, which no floor does; MuJoCo
-    Menagerie's Go2 has 100. With the model's iterations the solver stops early, and the feet skate.
+    Menagerie's Go2 sticks the same way. With the model's iterations the solver stops early, and the feet skate.
     """
-    spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, impratio
+    spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100.0
     spec.option.iterations = spec.option.ls_iterations = 100
 
 
@@ -57,8 +57,8 @@ def build(body: Body, rng: np.random.Generator) -> tuple[mujoco.MjModel, Floats]
     """
     spec = mujoco.MjSpec.from_file(str(resources.files("hmc.go2") / "go2.xml"))
     spec.option.timestep = STEP
-    if body.impratio is not None:
-        stick(spec, body.impratio)
+    if body.sticks:
+        stick(spec)
     for actuator in list(spec.actuators):  # the stand-in's motors are `tools.robot.motors`
         spec.delete(actuator)
     for link in spec.bodies[1:]:
