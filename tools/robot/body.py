@@ -41,7 +41,7 @@ def stick(spec: mujoco.MjSpec) -> None:
     """Feet that stick to the ground: friction 100 times as stiff as what bears the weight.
 
     The planner's pyramids are quicker, but let feet creep by 1 mm/s a newton, which no floor does; MuJoCo
-    Menagerie's Go2 sticks the same way. With the model's iterations the solver stops early, and the feet skate.
+    Menagerie's Go2 sticks the same way. With the model's iterations the solver stops early, and feet skate.
     """
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100.0
     spec.option.iterations = spec.option.ls_iterations = 100
