@@ -1,8 +1,8 @@
 r"""Error-state Kalman filter of a legged body: IMU in, feet on the ground as measurements.
 
 Base: M. Bloesch et al., "State estimation for legged robots: consistent fusion of leg kinematics and IMU",
-RSS 2012, with the rotation error taken in the world frame, feet that roll and give way, and the ground's
-height.
+RSS 2012, with the rotation error taken in the world frame, feet that roll, give way and slide round, and the
+ground's height.
 
 ========== ===== ======================================================== ============
 state      error meaning                                                  unit
@@ -15,6 +15,7 @@ b_f        12:15 bias of the accelerometer                                m/s^2
 p[0..3]    15:27 centres of the foot spheres without load, world frame    m
 c          27    compliance of a foot and the ground under it             m/N
 l          28    how late the gyroscope reads                             s
+y          29    rate at which the feet slide round the body              rad/s
 ========== ===== ======================================================== ============
 
 The error of the attitude is the rotation vector phi with C = exp(phi) C_hat; all others are true minus
@@ -22,12 +23,14 @@ estimate. With the gyroscope's reading w_m, the accelerometer's f_m, w = w_m - b
 
 .. math::
     \dot C = C [w + l \dot w], \quad \dot v = C f + g, \quad \dot r = v, \quad
-    \dot p_i = \rho \, (C w_i) \times e_z
+    \dot p_i = \rho \, (C w_i) \times e_z + y \, e_z \times (p_i - r)
 
 where w_i is the angular velocity of shank i in the body frame and rho the radius of its foot: a foot that
 rolls on level ground without slipping has its contact point at rest, not its centre. How late the gyroscope
-is, is found out by what a swing leaves. The measurement of a foot that stands, with s_i its centre by
-kinematics, seen from the IMU, and n_i the load that it has given way to, is
+is, is found out by what a swing leaves. Feet that are set down again and again slide round the body, or seem
+to, for minutes on end: y keeps apart from the gyroscope's bias what would pass for it. The measurement of a
+foot that stands, with s_i its centre by kinematics, seen from the IMU, and n_i the load that it has given way
+to, is
 
 .. math::
     0 = C s_i + r + c \, n_i e_z - p_i
@@ -35,6 +38,13 @@ kinematics, seen from the IMU, and n_i the load that it has given way to, is
 The compliance is found out, too: the feet of a stance take the load in turns.
 
 Feet that do not stand are kept out: their covariance is 1 m^2, uncorrelated.
+
+**What nobody can know.** No reading tells heading and place, so that nothing must be learnt of them: an error
+phi = e_z goes with errors e_z x v, e_z x r and e_z x p of the rest, a direction that moves with the estimate
+(Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators",
+IJRR 2010). The transition therefore takes v, r and p as the step changes them, a foot's Jacobian its arm as
+p - r, and a correction turns with the error that was there, as in an invariant filter (Hartley et al., IJRR
+2020). Else the filter is sure of its heading to a degree however long it has drifted.
 """
 
 from __future__ import annotations
@@ -52,9 +62,9 @@ from deploy.so3 import Array, skew
 
 Flags = NDArray[np.bool_]
 Rows = Sequence[Sequence[float]]
-N = 29
+N = 30
 PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
-FEET, GIVE, LATE = slice(15, 27), 27, 28
+FEET, GIVE, LATE, SPIN = slice(15, 27), 27, 28, 29
 GRAVITY = 9.81
 _ARM = 0.4  # m, from the IMU to a foot
 _TINY = 1e-12
@@ -93,9 +103,9 @@ class Ekf:
     Attributes:
         q: attitude (w, x, y, z), (4,); C its matrix, (3, 3).
         v, r, bw, bf, p: see the module; p is (4, 3).
-        give, late: c and l of the module.
+        give, late, spin: c, l and y of the module.
         load: n of the module, 4 [N].
-        P: covariance of the error, (29, 29).
+        P: covariance of the error, (30, 30).
         stands: which feet are anchored, (4,) bool.
         sway, far: how much each leg sways, 0 to 1, and how far it has turned lately [rad], 4 each
             (`deploy.sway`).
@@ -107,7 +117,7 @@ class Ekf:
         self.C = np.eye(3)
         self.v, self.r, self.bw, self.bf = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         self.p = np.zeros((4, 3))
-        self.give = self.late = 0.0
+        self.give = self.late = self.spin = 0.0
         self.stands = np.zeros(4, dtype=bool)
         self.load, self.sway, self.far = [0.0] * 4, [1.0] * 4, [0.0] * 4
         # rotation of each shank since its foot touched down [rad], and the most of it, squared
@@ -116,14 +126,15 @@ class Ekf:
         self._F, self._still = np.eye(N), np.eye(N)
         self._FP = np.empty((N, N))
         self._H: dict[tuple[int, ...], Array] = {}  # by the feet that an update takes
+        self._carry = np.zeros((N, 3))
         self._legs: tuple[int, ...] = ()
         self._e, self._PHt, self._S = np.empty(0), np.empty(0), np.empty(0)
 
-    def transition(self, f: Array, roll: Rows, change: Array, dt: float) -> Array:
-        """Jacobian of the error after a step by the error before it, (29, 29), to first order in dt.
+    def transition(self, dv: Array, dr: Array, roll: Rows, change: Array, dt: float) -> Array:
+        """Jacobian of the error after a step by the error before it, (30, 30), to first order in dt.
 
         Args:
-            f: specific force without its bias, in the body frame [m/s^2], (3,).
+            dv, dr: what the specific force adds to velocity and place over the step [m/s], [m], (3,).
             roll: rotation of each shank in the world frame over the step [rad], 4 of 3.
             change: of the gyroscope's reading over the step [rad/s], (3,).
             dt: [s].
@@ -133,10 +144,13 @@ class Ekf:
         lag = self.C @ change
         F[PHI, LATE] = lag
         lag_x, lag_y, _ = (FOOT_RADIUS * lag).tolist()
-        x, y, z = (back @ f).tolist()
-        F[3, 1], F[3, 2], F[4, 0] = -z, y, z
-        F[4, 2], F[5, 0], F[5, 1] = -x, -y, x
+        for at, (x, y, z) in ((3, dv.tolist()), (6, dr.tolist())):
+            F[at, 1], F[at, 2], F[at + 1, 0] = z, -y, -z
+            F[at + 1, 2], F[at + 2, 0], F[at + 2, 1] = x, y, -x
         F[6, 3] = F[7, 4] = F[8, 5] = dt
+        F[SPIN, SPIN] = math.exp(-dt / self.cfg.spin_time)
+        slide = max(self.sway) * dt
+        spin, arms = slide * self.spin, (self.p - self.r).tolist()
         # the lever of a rolling foot is rho e_z: entry by entry, for most are zero
         lever = FOOT_RADIUS * back[1::-1]
         lever[1] *= -1.0
@@ -150,6 +164,9 @@ class Ekf:
             F[at, 2], F[at + 1, 2] = FOOT_RADIUS * x, FOOT_RADIUS * y
             F[at : at + 2, BW] = lever
             F[at, LATE], F[at + 1, LATE] = lag_y, -lag_x
+            F[at, SPIN], F[at + 1, SPIN] = -slide * arms[leg][1], slide * arms[leg][0]
+            F[at, 7] = F[at + 1, at] = spin
+            F[at, at + 1] = F[at + 1, 6] = -spin
         return F
 
     def predict(
@@ -180,7 +197,9 @@ class Ekf:
         phi = w * dt + self.late * change[:3]
         roll = (phi + turn) @ self.C.T
         rows = roll.tolist()
-        F = self.transition(f, rows, change[:3], dt)
+        first, second = so3.carried(phi, f)
+        dv, dr = self.C @ (dt * first), self.C @ (dt * dt * second)
+        F = self.transition(dv, dr, rows, change[:3], dt)
         np.matmul(F, self.P, out=self._FP)
         P = np.matmul(self._FP, F.T)
         P += P.T
@@ -194,22 +213,21 @@ class Ekf:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P
 
-        first, second = so3.carried(phi, f)
-        dv = self.C @ (dt * first)
         dv[2] -= GRAVITY * dt
-        dr = self.C @ (dt * dt * second)
         dr[2] -= 0.5 * GRAVITY * dt * dt
+        spin, arms = max(self.sway) * dt * self.spin, (self.p - self.r).tolist()
         self.r = self.r + dr + dt * self.v
         self.v = self.v + dv
         for leg, stands in enumerate(self.stands.tolist()):
             if stands:
-                x, y, _ = rows[leg]
-                self.p[leg, 0] += FOOT_RADIUS * y
-                self.p[leg, 1] -= FOOT_RADIUS * x
+                (x, y, _), (a, b, _) = rows[leg], arms[leg]
+                self.p[leg, 0] += FOOT_RADIUS * y - spin * b
+                self.p[leg, 1] -= FOOT_RADIUS * x - spin * a
+        self.spin *= float(F[SPIN, SPIN])
         self.q, self.C = so3.turned(self.q, phi)
 
     def _walk(self, w: Array, f: Array, roll: Rows, dt: float, hidden: float, loose: Rows) -> list[float]:
-        """Diagonal of the step's noise, 29; `hidden` is the time [s^2] in which changes went unseen."""
+        """Diagonal of the step's noise, 30; `hidden` is the time [s^2] in which changes went unseen."""
         cfg = self.cfg
         shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
         hidden *= max(self.sway)
@@ -227,7 +245,7 @@ class Ekf:
             self._turned[leg] = x, y, z, turned
             foot = cfg.foot**2 * dt + cfg.bend**2 * (turned - most)
             Q += (foot + across * dt, foot + across * dt, foot + down * dt)
-        Q += (cfg.give_walk**2 * dt, 0.0)
+        Q += (cfg.give_walk**2 * dt, 0.0, cfg.spin**2 * (1.0 - math.exp(-2.0 * dt / cfg.spin_time)))
         return Q
 
     def anchor(self, leg: int, s: Array) -> None:
@@ -285,10 +303,11 @@ class Ekf:
         for k, leg in enumerate(legs):
             x, y, z = so3.rotated(C, s[leg])
             q, load = p[leg], self.load[leg]
-            e += (q[0] - r[0] - x, q[1] - r[1] - y, q[2] - r[2] - z - self.give * load)
+            a, b, c = q[0] - r[0], q[1] - r[1], q[2] - r[2] - self.give * load
+            e += (a - x, b - y, c - z)
             H[3 * k + 2, GIVE] = load
-            H[3 * k, 1], H[3 * k, 2], H[3 * k + 1, 0] = z, -y, -z
-            H[3 * k + 1, 2], H[3 * k + 2, 0], H[3 * k + 2, 1] = x, y, -x
+            H[3 * k, 1], H[3 * k, 2], H[3 * k + 1, 0] = c, -b, -c
+            H[3 * k + 1, 2], H[3 * k + 2, 0], H[3 * k + 2, 1] = a, b, -a
         e += [FOOT_RADIUS - p[leg][2] for leg in legs]
         PHt = self.P @ H.T
         S = H @ PHt
@@ -300,7 +319,7 @@ class Ekf:
         return [distance(cells, e, 3 * k) for k in range(n)]
 
     def _rows(self, legs: tuple[int, ...]) -> Array:
-        """Jacobian of the residuals of some feet, (4 n, 29): places first, then heights."""
+        """Jacobian of the residuals of some feet, (4 n, 30): places first, then heights."""
         if legs not in self._H:
             n = len(legs)
             H = np.zeros((4 * n, N))
@@ -360,3 +379,10 @@ class Ekf:
         self.p += d[FEET].reshape(4, 3)
         self.give += float(d[GIVE])
         self.late += float(d[LATE])
+        self.spin += float(d[SPIN])
+        # an error phi that was there turns what was added to v, r and p
+        turned = so3.skew(-d.reshape(-1, 3))
+        carry, P = self._carry, self.P
+        carry[3:9], carry[FEET] = turned[1:3].reshape(6, 3), turned[5:9].reshape(12, 3)
+        P = P + carry @ P[PHI]
+        self.P = P + P[:, PHI] @ carry.T

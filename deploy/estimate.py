@@ -25,7 +25,7 @@ class Estimate:
         acc_bias: [m/s^2], (3,).
         contact: feet that carry load, (4,) bool.
         used: feet that this tick's update used, (4,) bool.
-        P: covariance of the filter's error, see `deploy.ekf`, (29, 29).
+        P: covariance of the filter's error, see `deploy.ekf`, (30, 30).
         gyro_noise: standard deviation of the angular velocity's noise [rad/s].
     """
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from deploy import so3
 from deploy.contact import ContactCfg, Fall, FallCfg, FootContact
-from deploy.ekf import BF, BW, GIVE, GRAVITY, LATE, PHI, Ekf, Flags, R, V, distance
+from deploy.ekf import BF, BW, GIVE, GRAVITY, LATE, PHI, SPIN, Ekf, Flags, R, V, distance
 from deploy.estimate import Estimate
 from deploy.footing import Footing, FootingCfg
 from deploy.kinematics import FOOT_RADIUS, IMU, Chain, Vector, chains, lowest
@@ -232,7 +232,7 @@ class Estimator:
         variance[PHI], variance[V] = (1.0, 1.0, 1e-8), stood.velocity_error**2
         variance[R] = 1e-8, 1e-8, noise.ground**2 if foot else _LYING**2
         variance[BW], variance[BF] = noise.gyro_bias**2, noise.acc_bias**2
-        variance[GIVE], variance[LATE] = noise.give**2, noise.late**2
+        variance[GIVE], variance[LATE], variance[SPIN] = noise.give**2, noise.late**2, noise.spin**2
         ekf.P = np.diag(variance)
         ekf.observe_rate(stood.rate, stood.rate_variance)
         ekf.observe_force(stood.force, np.full(3, stood.force_error**2))

@@ -38,6 +38,8 @@ class NoiseCfg:
             its error 0.015 mm along an axis, but the same for some readings.
         give: of a foot's compliance before the first reading [m/N].
         give_walk: of its random walk [m/N/sqrt(s)].
+        spin: of the rate at which the feet of a body that sways slide round it [rad/s].
+        spin_time: for how long that stays the same [s].
         sway: angle that a leg has turned lately from which on it sways as much as any [rad]; below it, as its
             square.
         sway_time: what is lately [s].
@@ -65,6 +67,8 @@ class NoiseCfg:
     encoder: float = 0.00002
     give: float = 2e-5
     give_walk: float = 1e-6
+    spin: float = 0.003
+    spin_time: float = 100.0
     sway: float = 0.01
     sway_time: float = 0.1
     calm_time: float = 0.3

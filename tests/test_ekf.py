@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deploy import so3
-from deploy.ekf import BF, BW, FEET, GIVE, GRAVITY, LATE, PHI, Ekf, N, R, V, distance, foot
+from deploy.ekf import BF, BW, FEET, GIVE, GRAVITY, LATE, PHI, SPIN, Ekf, N, R, V, distance, foot
 from deploy.kinematics import FOOT_RADIUS
 from deploy.noise import NoiseCfg
 
@@ -25,7 +25,7 @@ def random_filter(seed: int = 0, stands=(True, True, False, True)) -> Ekf:
     ekf.C = so3.matrix(ekf.q)
     ekf.v, ekf.r, ekf.p = rng.normal(size=3), rng.normal(size=3), rng.normal(size=(4, 3))
     ekf.bw, ekf.bf = 0.01 * rng.normal(size=3), 0.1 * rng.normal(size=3)
-    ekf.give, ekf.late = 1e-3 * rng.normal(size=2)
+    ekf.give, ekf.late, ekf.spin = 1e-3 * rng.normal(size=3)
     ekf.load = [60.0, 90.0, 0.0, 20.0]
     root = 0.1 * rng.normal(size=(N, N))
     ekf.P = root @ root.T + 1e-3 * np.eye(N)
@@ -37,18 +37,18 @@ def random_filter(seed: int = 0, stands=(True, True, False, True)) -> Ekf:
 
 
 def plus(ekf: Ekf, d: np.ndarray) -> Ekf:
-    """The filter with its state moved by an error (29,)."""
+    """The filter with its state moved by an error (30,)."""
     out = copy.deepcopy(ekf)
     out.q = so3.multiply(so3.quaternion(d[PHI]), ekf.q)
     out.C = so3.matrix(out.q)
     out.v, out.r = ekf.v + d[V], ekf.r + d[R]
     out.bw, out.bf, out.p = ekf.bw + d[BW], ekf.bf + d[BF], ekf.p + d[FEET].reshape(4, 3)
-    out.give, out.late = ekf.give + d[GIVE], ekf.late + d[LATE]
+    out.give, out.late, out.spin = ekf.give + d[GIVE], ekf.late + d[LATE], ekf.spin + d[SPIN]
     return out
 
 
 def minus(a: Ekf, b: Ekf) -> np.ndarray:
-    """Error (29,) of filter b if a is true."""
+    """Error (30,) of filter b if a is true."""
     phi = so3.log(so3.multiply(a.q, b.q * [1, -1, -1, -1]))
     parts = (
         phi,
@@ -57,7 +57,7 @@ def minus(a: Ekf, b: Ekf) -> np.ndarray:
         a.bw - b.bw,
         a.bf - b.bf,
         (a.p - b.p).reshape(12),
-        [a.give - b.give, a.late - b.late],
+        [a.give - b.give, a.late - b.late, a.spin - b.spin],
     )
     return np.concatenate(parts)
 
@@ -81,14 +81,20 @@ def test_transition_by_finite_differences(seed):
         numeric[:, j] = minus(up, down) / (2 * h)
     w = gyro - ekf.bw
     roll = (turn + w * dt + ekf.late * change[:3]) @ ekf.C.T
-    F = ekf.transition(acc - ekf.bf, roll.tolist(), change[:3], dt)
+    dv = ekf.C @ (acc - ekf.bf) * dt
+    F = ekf.transition(dv, 0.5 * dt * dv, roll.tolist(), change[:3], dt)
     # to first order in dt: what is left is of the second
     np.testing.assert_allclose((F - np.eye(N)) / dt, (numeric - np.eye(N)) / dt, atol=5e-3)
 
 
+def standing(ekf: Ekf) -> np.ndarray:
+    """Foot centres from the IMU in the body frame where the filter has them, (4, 3)."""
+    return (ekf.p - ekf.r - ekf.give * np.outer(ekf.load, [0.0, 0.0, 1.0])) @ ekf.C
+
+
 def test_foot_jacobian_by_finite_differences():
     ekf, h = random_filter(stands=(True,) * 4), 1e-6
-    s = np.random.default_rng(1).normal(size=(4, 3)).tolist()
+    s = standing(ekf).tolist()
     numeric = np.zeros((16, N))
     for j in range(N):
         up, down = (plus(ekf, sign * h * np.eye(N)[j]) for sign in (1, -1))
@@ -125,7 +131,8 @@ def test_an_update_is_kalmans_with_the_feet_it_takes(legs):
     H = np.zeros((len(e), N))
     for k, leg in enumerate(legs):
         at = slice(3 * k, 3 * k + 3)
-        H[at, PHI], H[at, R], H[at, foot(leg)] = -so3.skew(ekf.C @ s[leg]), np.eye(3), -np.eye(3)
+        arm = ekf.C @ standing(ekf)[leg]  # by the filter's places, not by the reading
+        H[at, PHI], H[at, R], H[at, foot(leg)] = -so3.skew(arm), np.eye(3), -np.eye(3)
         H[3 * k + 2, GIVE] = ekf.load[leg]
         H[3 * len(legs) + k, foot(leg).stop - 1] = 1.0
     curved = 0.5 * (0.4 * (ekf.P[0, 0] + ekf.P[1, 1])) ** 2
@@ -139,9 +146,43 @@ def test_an_update_is_kalmans_with_the_feet_it_takes(legs):
         at = slice(3 * k, 3 * k + 3)
         assert far[k] == pytest.approx(e[at] @ np.linalg.solve(S[at, at], e[at]))
     joseph = (np.eye(N) - K @ H) @ ekf.P @ (np.eye(N) - K @ H).T + K @ np.diag(noise) @ K.T
+    carry, d = np.eye(N), K @ e
+    for part in (V, R, *map(foot, ALL)):
+        carry[part, PHI] = -so3.skew(d[part])
     ekf.correct(ground)
-    np.testing.assert_allclose(ekf.P, joseph, atol=1e-9)
+    np.testing.assert_allclose(ekf.P, carry @ joseph @ carry.T, atol=1e-9)
     np.testing.assert_allclose(minus(ekf, other), 0.0, atol=1e-9)
+
+
+def unknowable(ekf: Ekf) -> np.ndarray:
+    """Errors of a heading and a place that are not what they seem to be, (30, 3): no reading tells them."""
+    out, up = np.zeros((N, 3)), np.array([0.0, 0.0, 1.0])
+    out[PHI, 0], out[V, 0], out[R, 0] = up, np.cross(up, ekf.v), np.cross(up, ekf.r)
+    for leg in range(4):
+        if ekf.stands[leg]:
+            out[foot(leg), 0], out[foot(leg), 1:] = np.cross(up, ekf.p[leg]), np.eye(3)[:, :2]
+    out[R, 1:] = np.eye(3)[:, :2]
+    return out
+
+
+def test_steps_and_readings_tell_nothing_of_heading_and_place():
+    """To the last digit, whatever the corrections: knowledge of them would come out of nothing."""
+    rng, ekf, dt = np.random.default_rng(3), random_filter(3, (True,) * 4), 0.002
+    for _ in range(20):
+        gyro, acc, turn = 3.0 * rng.normal(size=3), 20.0 * rng.normal(size=3), 0.01 * rng.normal(size=(4, 3))
+        before, change = unknowable(ekf), rng.normal(size=6)
+        ekf.predict(gyro, acc, turn.tolist(), dt, change=change)
+        np.testing.assert_allclose(ekf._F @ before, unknowable(ekf), atol=1e-12)
+        after, P = unknowable(ekf), ekf.P
+        ekf.innovation(ALL, (standing(ekf) + 0.01 * rng.normal(size=(4, 3))).tolist())
+        np.testing.assert_allclose(ekf._rows(ALL) @ after, 0.0, atol=1e-12)
+        ekf.correct(1e-4)
+        corrected = unknowable(ekf)
+        assert np.abs(corrected - after).max() > 1e-3  # it did move
+        known, still = (
+            of.T @ np.linalg.solve(covariance, of) for of, covariance in ((after, P), (corrected, ekf.P))
+        )
+        np.testing.assert_allclose(still, known, rtol=1e-6)
 
 
 def test_feet_that_take_the_load_in_turns_tell_how_they_give_way():
@@ -294,7 +335,8 @@ def test_an_anchor_is_an_update_of_a_foot_of_which_nothing_was_known():
     ekf, s = random_filter(4, stands=(True, False, False, False)), np.array([0.2, -0.1, -0.3])
     other = copy.deepcopy(ekf)
     ekf.anchor(2, s)
-    other.P[foot(2), foot(2)] = 1e4 * np.eye(3)
+    # its Jacobian has the arm where the filter has the foot: about right
+    other.P[foot(2), foot(2)], other.p[2] = 1e4 * np.eye(3), ekf.p[2] + 1e-3
     other.stands[2] = True
     other.innovation((2,), [[0.0] * 3, [0.0] * 3, s.tolist()])
     other.correct(None)
@@ -318,6 +360,7 @@ def test_standing_still_ties_tilt_to_the_accelerometers_bias():
 
 def test_covariance_stays_symmetric_and_positive():
     ekf, rng = Ekf(NoiseCfg()), np.random.default_rng(6)
+    ekf.P[SPIN, SPIN] = ekf.cfg.spin**2  # feet that might run round at 1 rad/s are beyond anything linear
     s = np.array([[0.2, 0.15, -0.3], [0.2, -0.15, -0.3], [-0.2, 0.15, -0.3], [-0.2, -0.15, -0.3]])
     for k in range(1000):
         ekf.predict(
