@@ -231,7 +231,7 @@ class Ekf:
         cfg = self.cfg
         shake = abs(math.sqrt(float(f @ f)) - GRAVITY)
         hidden *= max(self.sway)
-        speed = (cfg.acc**2 + (cfg.scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
+        speed = (cfg.acc**2 + (cfg.acc_scale * shake) ** 2) * dt * dt + (cfg.jerk * hidden) ** 2
         angle = (cfg.gyro**2 + cfg.scale**2 * float(w @ w)) * dt * dt + (cfg.turn * hidden) ** 2
         place, gyro, acc = speed * dt * dt / 3.0, cfg.gyro_walk**2 * dt, cfg.acc_walk**2 * dt
         Q = [angle] * 3 + [speed] * 3 + [place] * 3 + [gyro] * 3 + [acc] * 3

@@ -25,7 +25,7 @@ class FootingCfg:
 
     settle: float = 0.1
     settle_time: float = 0.01
-    bounce: float = 0.15
+    bounce: float = 0.25
     bounce_time: float = 0.025
     slide_time: float = 0.004
     slide_gate: float = 2.0

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 class NoiseCfg:
     """Standard deviations, all of them of one axis.
 
-    Those of readings are the simulated sensors', the accelerometer's a little less; walks of the biases are
+    Those of readings are the simulated sensors', the accelerometer's somewhat less; walks of the biases are
     half as large again as theirs. These and those of the feet were chosen so that the errors are as large as
     the filter says (docs/estimator.md).
 
     Attributes:
         gyro: of a reading [rad/s].
         acc: of a reading [m/s^2].
-        scale: of a reading, relative to what it reads beyond rest: coning, timing, scale factors.
+        scale: of a reading of the gyroscope, relative to what it reads: coning, timing, scale factors.
+        acc_scale: of one of the accelerometer, relative to what it reads beyond rest.
         sample: of what a shock does unseen between two accelerometer readings, relative to their difference
             beyond `shock`.
         shock: difference of two readings up to which motion is smooth: what one hides, the next tells
@@ -49,8 +50,9 @@ class NoiseCfg:
     """
 
     gyro: float = 0.01
-    acc: float = 0.093
-    scale: float = 0.005
+    acc: float = 0.086
+    scale: float = 0.01
+    acc_scale: float = 0.005
     sample: float = 0.15
     shock: float = 5.0
     gyro_walk: float = 1.5e-4
@@ -63,7 +65,7 @@ class NoiseCfg:
     bend: float = 0.002
     late: float = 1e-3
     kinematics: float = 0.00025
-    swing: float = 0.0045
+    swing: float = 0.0035
     encoder: float = 0.00002
     give: float = 2e-5
     give_walk: float = 1e-6
