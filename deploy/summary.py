@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from deploy.control import TICK
-from deploy.ekf import R, V
+from deploy.ekf import PHI, R, V
 from deploy.log import read
 from deploy.modes import HAND, NAMES, NONE
 from deploy.safety import Phase
@@ -87,8 +88,9 @@ def accuracy(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, float] | Non
     """How far the estimate was from the truth at the ticks of the hybrid phase; None where there are none.
 
     Velocity in the body frame [m/s], as a heading cannot be known; height [m]; tilt, the error of gravity's
-    direction [deg]. `sigmas`: in standard deviations, of velocity and tilt the root mean square over axes and
-    ticks, 1 where the covariance is right.
+    direction [deg]; heading [rad] and place [m], which cannot be known: how far they drifted. `sigmas`: in
+    standard deviations, of velocity and tilt the root mean square over axes and ticks, 1 where the covariance
+    is right; of a drift those of what was added since the first tick.
     """
     known, x = _meet(path, hybrid)
     if not known:
@@ -104,6 +106,16 @@ def accuracy(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, float] | Non
     def sigmas(error: np.ndarray, of: slice) -> float:
         return round(float(np.sqrt(np.mean(error**2 / np.maximum(variance[:, of], 1e-12)))), 2)
 
+    # the turn from the true world to the estimate's
+    turn = np.einsum("nij,nkj->nik", told, true)
+    heading = np.unwrap(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
+    c, s = math.cos(heading[0]), math.sin(heading[0])
+    place = estimate[-1, :2] - estimate[0, :2] - np.array([[c, -s], [s, c]]) @ (x[-1, :2] - x[0, :2])
+
+    def drift(name: str, error: float, *of: int) -> dict[str, float]:
+        added = max(float((variance[-1] - variance[0])[list(of)].sum()), 1e-12)
+        return {f"{name}_last": round(error, 3), f"{name}_sigmas": round(error / math.sqrt(added), 2)}
+
     return {
         "velocity_rms": round(float(np.sqrt(np.mean(np.sum(velocity**2, 1)))), 4),
         "velocity_sigmas": sigmas(velocity, V),
@@ -114,6 +126,8 @@ def accuracy(path: Path, hybrid: list[dict[str, Any]]) -> dict[str, float] | Non
         "height_sigmas_max": round(
             float((height / np.sqrt(np.maximum(variance[:, R.stop - 1], 1e-12))).max()), 2
         ),
+        **drift("heading", float(abs(heading[-1] - heading[0])), PHI.stop - 1),
+        **drift("place", float(np.hypot(*place)), R.start, R.start + 1),
     }
 
 

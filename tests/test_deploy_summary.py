@@ -41,18 +41,24 @@ def test_memory_is_looked_at_once_it_is_warm(monkeypatch):
 def test_the_estimate_against_the_truth(tmp_path, heading):
     """Off by (0.3, 0.4, 0) m/s and 10 mrad about x, by 2 cm at the end; sure to 0.1, 0.005, and 1 cm.
 
-    The estimate's world may be turned about the vertical: nobody can know its heading.
+    The estimate's world may be turned about the vertical, and shifted: nobody can know its heading. By 0.03
+    rad and half a metre more at the end than at first; it is so much more unsure by 0.01 and 0.2.
     """
     x = np.tile(FOOTSTAND.state().numpy(), (4, 1))
+    x[:, 0] = np.arange(4.0)
     np.savez(tmp_path / "truth.npz", tick=[20, 40, 60, 80], qpos=x[:, :19], qvel=x[:, 19:])
-    lean, turn = so3.quaternion(np.array([0.01, 0.0, 0.0])), so3.quaternion(np.array([0.0, 0.0, heading]))
+    lean, at = so3.quaternion(np.array([0.01, 0.0, 0.0])), so3.exp(np.array([0.0, 0.0, heading]))
     ticks: list[dict[str, Any]] = []
     for i in range(4):
         told, variance = x[i].copy(), np.full(N, 7.0)
+        last = float(i == 3)
+        turn = so3.quaternion(np.array([0.0, 0.0, heading + 0.03 * last]))
+        told[:3] = at @ told[:3] + last * np.array([0.3, -0.4, 0.0])
         told[3:7] = so3.multiply(turn, so3.multiply(lean, told[3:7]))
         told[19:22] = so3.matrix(turn) @ (told[19:22] + np.array([0.3, 0.4, 0.0]))
         told[2] += 0.02 if i == 3 else -0.001
-        variance[:2], variance[V], variance[R] = 0.005**2, 0.01, (9.0, 9.0, 1e-4)
+        variance[:2], variance[V] = 0.005**2, 0.01
+        variance[2], variance[R] = 1.0 + 1e-4 * last, (9.0, 9.0 + 0.04 * last, 1e-4)
         ticks.append({"ms": 20 * (i + 1), "x": told.tolist(), "variance": variance.tolist()})
     ticks.append({**ticks[0], "ms": 999})  # whose truth is not known
     found = accuracy(tmp_path / "truth.npz", ticks)
@@ -64,6 +70,10 @@ def test_the_estimate_against_the_truth(tmp_path, heading):
         "height_max": 0.02,
         "height_last": 0.02,
         "height_sigmas_max": 2.0,
+        "heading_last": 0.03,
+        "heading_sigmas": 3.0,
+        "place_last": 0.5,
+        "place_sigmas": 2.5,
     }
     assert found == pytest.approx(expected, abs=0.006)
     assert accuracy(tmp_path / "truth.npz", ticks[4:]) is None
