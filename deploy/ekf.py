@@ -209,6 +209,9 @@ class Ekf:
         if (size := math.sqrt(float(change[3:] @ change[3:]))) > self.cfg.shock:  # along it, not across
             doubt = self.cfg.sample * (1.0 - self.cfg.shock / size) * dt
             diagonal[V] += (doubt * (self.C @ change[3:])) ** 2
+        # together they may rise by what no reading tells, so that velocity and tilt have no part in it
+        heights = [R.stop - 1, *(foot(leg).stop - 1 for leg in np.flatnonzero(self.stands).tolist())]
+        P[np.ix_(heights, heights)] += self.cfg.rise**2 * dt
         if jump is not None:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P

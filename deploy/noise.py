@@ -45,6 +45,7 @@ class NoiseCfg:
             square.
         sway_time: what is lately [s].
         calm_time: in which swaying that is over goes down to 1/e [s].
+        rise: of the walk of body and feet together, up and down, for which there is no reading [m/sqrt(s)].
         ground: of the ground's height at a foothold [m].
         ground_time: for how long its errors stay the same [s].
     """
@@ -74,5 +75,6 @@ class NoiseCfg:
     sway: float = 0.01
     sway_time: float = 0.1
     calm_time: float = 0.3
+    rise: float = 0.0015
     ground: float = 0.01
     ground_time: float = 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -304,6 +305,16 @@ def test_a_foot_that_has_just_landed_walks_more():
     more = np.diag(fresh.P - firm.P)[FEET].reshape(4, 3)
     walked = [2e-6, 2e-6, 8e-6]
     np.testing.assert_allclose(more, [walked, walked, [0] * 3, [0] * 3], atol=1e-15)
+
+
+def test_body_and_standing_feet_may_rise_together():
+    plain, rising = random_filter(), random_filter()
+    plain.cfg, rising.cfg = replace(plain.cfg, rise=0.0), replace(plain.cfg, rise=0.1)
+    for ekf in (plain, rising):
+        ekf.predict(np.zeros(3), -DOWN, NO_TURN, 0.002)
+    up = np.zeros(N)
+    up[[8, 17, 20, 26]] = 1.0  # of the third foot, which hangs, nothing is known
+    np.testing.assert_allclose(rising.P - plain.P, 2e-5 * np.outer(up, up), atol=1e-15)
 
 
 def test_a_shank_that_turns_widens_its_foot_by_how_far_from_where_it_was_and_once():
