@@ -71,7 +71,7 @@ class NoiseCfg:
     give: float = 2e-5
     give_walk: float = 1e-6
     spin: float = 0.003
-    spin_time: float = 100.0
+    spin_time: float = 1000.0
     sway: float = 0.01
     sway_time: float = 0.1
     calm_time: float = 0.3
