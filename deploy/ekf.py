@@ -218,14 +218,13 @@ class Ekf:
 
         dv[2] -= GRAVITY * dt
         dr[2] -= 0.5 * GRAVITY * dt * dt
-        spin, arms = max(self.sway) * dt * self.spin, (self.p - self.r).tolist()
         self.r = self.r + dr + dt * self.v
         self.v = self.v + dv
         for leg, stands in enumerate(self.stands.tolist()):
             if stands:
-                (x, y, _), (a, b, _) = rows[leg], arms[leg]
-                self.p[leg, 0] += FOOT_RADIUS * y - spin * b
-                self.p[leg, 1] -= FOOT_RADIUS * x - spin * a
+                (x, y, _), at = rows[leg], foot(leg).start
+                self.p[leg, 0] += FOOT_RADIUS * y + self.spin * F[at, SPIN]
+                self.p[leg, 1] -= FOOT_RADIUS * x - self.spin * F[at + 1, SPIN]
         self.spin *= float(F[SPIN, SPIN])
         self.q, self.C = so3.turned(self.q, phi)
 
