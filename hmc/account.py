@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 import torch
@@ -25,18 +26,23 @@ class Account:
         dt: duration of a control step [s].
         recorder: that what steps cost is told to; None for none.
         judge: whether a step whose states or inputs are no numbers is to cost NaN, whatever the cost says.
+        near: whether one may look at a number without waiting for a device.
 
     Attributes:
         sums: stage terms of the steps that are priced, (number of stage terms, worlds).
     """
 
-    def __init__(self, task: Task, worlds: int, dt: float, recorder: Recorder | None, judge: bool):
+    def __init__(
+        self, task: Task, worlds: int, dt: float, recorder: Recorder | None, judge: bool, near: bool
+    ):
         self.sums = np.empty((len(task.cost.stage), worlds))
         self._cost, self._dt, self._recorder, self._judge = task.cost, dt, recorder, judge
-        # of the last steps which one it is, who made it, x, u and u before; and after how many of these
-        # worlds were born
+        self._near = near
+        self._priced = 0  # steps
+        # of those after them which one it is, who made it, x, u and u before; and after how many steps worlds
+        # were born
         self._steps: list[tuple[int, Indices | slice, Tensor, Tensor, Tensor]] = []
-        self._births: list[tuple[int, slice, Indices]] = []
+        self._births: deque[tuple[int, slice, Indices]] = deque()
 
     def __len__(self) -> int:
         """Steps that are not priced yet."""
@@ -48,7 +54,7 @@ class Account:
 
     def born(self, children: slice, parents: Indices) -> None:
         """Worlds go on from what others cost so far."""
-        self._births.append((len(self), children, parents))
+        self._births.append((self._priced + len(self), children, parents))
         self._inherit()
 
     def costs(self, first: int) -> Tensor:
@@ -61,7 +67,10 @@ class Account:
         x, u, u_prev = map(joined, zip(*[step[2:] for step in self._steps], strict=True))
         ks = upload(np.array([first + step[0] for step in self._steps]).repeat(widths), x.device)
         found = self._cost.stage_terms(x, u, u_prev, ks).to(torch.float64)
-        return found.masked_fill(~(finite(x) & finite(u))[:, None], math.nan) if self._judge else found
+        # a finite sum has finite parts
+        if not self._judge or (self._near and math.isfinite(float(x.sum()) + float(u.sum()))):
+            return found
+        return found.masked_fill(~(finite(x) & finite(u))[:, None], math.nan)
 
     def settle(self, costs: Floats) -> None:
         """Add what `costs` came to."""
@@ -75,7 +84,7 @@ class Account:
             sums += stage
             if self._recorder is not None:
                 self._recorder.step(i, branches, stage)
-            self._births = [(after - 1, children, parents) for after, children, parents in self._births]
+            self._priced += 1
             self._inherit()
 
     def keep(self, worlds: Indices) -> None:
@@ -84,6 +93,6 @@ class Account:
 
     def _inherit(self) -> None:
         """Give worlds the sums of those that they were born from, where these are known by now."""
-        while self._births and self._births[0][0] == 0:
-            _, children, parents = self._births.pop(0)
+        while self._births and self._births[0][0] == self._priced:
+            _, children, parents = self._births.popleft()
             self.sums[:, children] = self.sums.take(parents, 1)

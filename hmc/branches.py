@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ class Branches:
         born: how many branches are born before step i, for i = 0 ... T + 1. Those of step T differ from
             their parent nowhere.
         seeds: how many of those born at step i, the first ones, part from the trunk.
+        last: the step from which on each schedule stays in one mode, (n,).
     """
 
     row: Tensor
@@ -34,6 +36,15 @@ class Branches:
     parent: Tensor
     born: list[int]
     seeds: list[int]
+    last: np.ndarray
+
+    @cached_property
+    def settled(self) -> np.ndarray:
+        """The step from which on a branch stays in one mode and none parts from it, (n,)."""
+        births, parent = np.arange(len(self.born) - 1).repeat(np.diff(self.born)), self.parent.numpy()
+        parted, some = np.zeros_like(births), parent >= 0
+        parted[parent[some]] = births[some]  # of several the last one, as they come in order of birth
+        return np.maximum(self.last, parted)
 
     def path(self, row: int) -> list[int]:
         """The branch that a given schedule is at each step i = 0 ... T; -1 while it is the trunk."""
@@ -64,7 +75,7 @@ def branches(schedules: Tensor, trunk: Sequence[int]) -> Branches:
     steps = _steps(schedules)
     birth, parent = _parted(steps, trunk)
     slots = _slots(birth, parent, len(steps))
-    return _tree(torch.from_numpy(steps.take(slots, 1)).T, slots, birth, parent)
+    return _tree(torch.from_numpy(steps.take(slots, 1)).T, slots, birth, parent, _last(steps))
 
 
 def fan(switched: Neighbours, trunk: Sequence[int], beside: bool) -> Branches:
@@ -92,14 +103,16 @@ def fan(switched: Neighbours, trunk: Sequence[int], beside: bool) -> Branches:
         if len(along) > 0:
             birth[along], stems = _parted(_steps(switched[along].tensor()), trunk)
             parent[along] = np.where(stems < 0, -1, along[stems] + beside)
+    calm = int(_last(np.array(base)[:, None])[0])
+    last = np.where(stop < horizon, np.maximum(stop, calm), start)
     if beside:
-        birth, parent = np.r_[apart, birth], np.r_[-1, parent]
+        birth, parent, last = np.r_[apart, birth], np.r_[-1, parent], np.r_[calm, last]
     slots = _slots(birth, parent, horizon)
     if not beside:
-        return _tree(switched[slots].tensor(), slots, birth, parent)
+        return _tree(switched[slots].tensor(), slots, birth, parent, last)
     modes = switched[np.maximum(slots - 1, 0)].tensor()
     modes[int(np.flatnonzero(slots == 0)[0])] = torch.tensor(base)
-    return _tree(modes, slots, birth, parent)
+    return _tree(modes, slots, birth, parent, last)
 
 
 def _parted(steps: np.ndarray, trunk: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +145,17 @@ def _sorted(values: np.ndarray, largest: int) -> np.ndarray:
     return np.argsort(values.astype(np.uint16 if largest < 2**16 else np.int64), kind="stable")
 
 
-def _tree(modes: Tensor, slots: np.ndarray, birth: np.ndarray, parent: np.ndarray) -> Branches:
+def _last(steps: np.ndarray) -> np.ndarray:
+    """The step from which on each of schedules (T, n) stays in one mode, (n,)."""
+    last = np.zeros(steps.shape[1], dtype=np.int64)
+    for i in range(1, len(steps)):
+        np.copyto(last, i, where=steps[i] != steps[i - 1])
+    return last
+
+
+def _tree(
+    modes: Tensor, slots: np.ndarray, birth: np.ndarray, parent: np.ndarray, last: np.ndarray
+) -> Branches:
     """The tree of schedules (n, T) in order `slots` of birth, of rows that part when `_parted` says."""
     rank = np.empty_like(slots)
     rank[slots] = np.arange(len(slots))
@@ -143,6 +166,7 @@ def _tree(modes: Tensor, slots: np.ndarray, birth: np.ndarray, parent: np.ndarra
         parent=torch.from_numpy(np.where(stems < 0, -1, rank[stems])),
         born=[0, *np.cumsum(np.bincount(birth, minlength=steps)).tolist()],
         seeds=np.bincount(birth[parent < 0], minlength=steps).tolist(),
+        last=last[slots],
     )
 
 

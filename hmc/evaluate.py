@@ -109,32 +109,32 @@ class Evaluator:
             stop: asked before every control step; once it says True, what is not known yet comes back
                 as NaN.
         """
-        these, used = _spelt(schedules), _used(schedules)
+        used = _used(schedules)
         if used.numel() and not 0 <= int(used.min()) <= int(used.max()) < len(self.task.modes):
             raise ValueError(
                 f"schedules hold modes {int(used.min())} to {int(used.max())}: task "
                 f"{self.task.name!r} has 0 to {len(self.task.modes) - 1}"
             )
-        rows = self._table.rows(these)
+        rows = self._table.rows(schedules)
         every = np.arange(len(rows))
         earliest = np.empty(rows.max(initial=0) + 1, dtype=np.int64)
         earliest[rows[::-1]] = every[::-1]
         todo = np.flatnonzero((earliest[rows] == every) & self._table.missing(rows, bound))  # each once
-        todo = self._allowed(todo, rows, these)
+        todo = self._allowed(todo, rows, schedules)
         if len(todo) > self.size:  # neighbours share most: let them be in one chunk
-            todo = todo[in_order(_rows(these, todo).cpu(), self._lead)]
+            todo = todo[in_order(_spelt(_some(schedules, todo)).cpu(), self._lead)]
         first = 0
         while first < len(todo):
             beside = self._beside
             size = self.size - len(beside)
             chunk = todo[first : first + size]
             modes = beside[0].modes if beside else None
-            wanted = schedules[chunk] if isinstance(schedules, Neighbours) else _rows(schedules, chunk)
-            rolled = roll(self._worlds, self._trunk, wanted, bound, stop, modes)
+            rolled = roll(self._worlds, self._trunk, _some(schedules, chunk), bound, stop, modes)
             if rolled is None:
                 break
-            if rolled.trace is not None:
-                self._trunk, self._next = rolled.trace, None
+            if rolled.trace is not None and self._next is not None:
+                followed, self._trunk, self._next = self._next, rolled.trace, None
+                self._know(followed)
             self._learn(rows[chunk], rolled)
             self._keep(rows[chunk], rolled)
             first += size
@@ -145,11 +145,10 @@ class Evaluator:
 
         Fewer if some are pruned or barred; none for those that break a rule.
         """
-        schedules = _spelt(schedules)
         new = self._table.missing(self._table.rows(schedules), math.inf)
         if self.task.rules is not None:
-            new &= ~self._broken(schedules).cpu().numpy()
-        wanted, horizon = _rows(schedules, np.flatnonzero(new)).cpu(), self.task.horizon
+            new &= ~self._broken(_spelt(schedules)).cpu().numpy()
+        wanted, horizon = _spelt(_some(schedules, np.flatnonzero(new))).cpu(), self.task.horizon
         ahead = [schedule.tensor()[None].to(wanted.dtype) for schedule in self._beside]
         shared, alone = added_steps(torch.cat([*ahead, wanted]), self._lead)
         # a part that does not fit into the simulator with those before it rolls one beginning out again
@@ -183,16 +182,15 @@ class Evaluator:
         self._next = schedule
         self.record()
         self._traces = {}
-        cost, terms, barred = self.trunk.cost, self.trunk.terms, self.trunk.barred
-        if self.task.ensemble is not None:
-            costs = torch.tensor([[each.cost for each in self._trunk]], dtype=torch.float64)
-            cost = float(self.task.ensemble.risk(costs)[0])
-            terms = self.task.ensemble.terms(torch.stack([each.terms for each in self._trunk])[None])[0]
-        self.rollouts += 1
-        self.ruled_out += barred
-        self.diverged += not (math.isfinite(cost) or barred)
-        self._table.learn(rows, np.array([cost]), np.array([False]), terms.cpu().numpy()[None])
-        return cost
+        return self._know(schedule)
+
+    def aim(self, schedule: Schedule) -> None:
+        """As `follow`, but a schedule of unknown cost is rolled out beside the next batch, if it has room."""
+        rows = schedule.tensor()[None]
+        if self.size == 1 or not self._table.missing(self._table.rows(rows), math.inf)[0]:
+            self.follow(schedule)
+        elif len(self._allowed(np.array([0]), self._table.rows(rows), rows)) > 0:
+            self._next = schedule
 
     @torch.no_grad()
     def record(self) -> None:
@@ -230,12 +228,12 @@ class Evaluator:
         assert self.task.rules is not None
         return self.task.rules.broken(self.task.modes, schedules, self.start.mode, self.start.ran)
 
-    def _allowed(self, at: Rows, rows: Rows, schedules: Tensor) -> Rows:
+    def _allowed(self, at: Rows, rows: Rows, schedules: Tensor | Neighbours) -> Rows:
         """Those of the schedules `at` (n,) that break no rule; what breaks one is known to cost inf."""
         rules = self.task.rules
         if rules is None or len(at) == 0:
             return at
-        broken = self._broken(_rows(schedules, at)).cpu().numpy()
+        broken = self._broken(_spelt(_some(schedules, at))).cpu().numpy()
         out = rows[at[broken]]
         nothing = np.full((len(out), len(self.task.cost.names)), math.nan)
         self._table.learn(out, np.full(len(out), math.inf), np.zeros(len(out), dtype=bool), nothing)
@@ -248,6 +246,21 @@ class Evaluator:
         self._traces = (
             {} if traces is None else {row: partial(traces, i) for i, row in enumerate(rows.tolist())}
         )
+
+    def _know(self, schedule: Schedule) -> float:
+        """Take down what the schedule costs that was just recorded, if that is new; its cost."""
+        rows = self._table.rows(schedule.tensor()[None])
+        if self._table.missing(rows, math.inf)[0]:
+            cost, terms, barred = self.trunk.cost, self.trunk.terms, self.trunk.barred
+            if self.task.ensemble is not None:
+                costs = torch.tensor([[each.cost for each in self._trunk]], dtype=torch.float64)
+                cost = float(self.task.ensemble.risk(costs)[0])
+                terms = self.task.ensemble.terms(torch.stack([each.terms for each in self._trunk])[None])[0]
+            self.rollouts += 1
+            self.ruled_out += barred
+            self.diverged += not (math.isfinite(cost) or barred)
+            self._table.learn(rows, np.array([cost]), np.array([False]), terms.cpu().numpy()[None])
+        return float(self._table.costs(rows, math.inf)[0])
 
     def _learn(self, rows: Rows, rolled: Rolled) -> None:
         self.rollouts += len(rows)
@@ -270,6 +283,8 @@ def _used(schedules: Tensor | Neighbours) -> Tensor:
     return schedules
 
 
-def _rows(schedules: Tensor, at: Rows) -> Tensor:
-    """Rows of schedules (N, T), laid out as `SwitchSpace.stitch` and the rollout have them: by steps."""
+def _some(schedules: Tensor | Neighbours, at: Rows) -> Tensor | Neighbours:
+    """Rows of schedules (N, T), laid out as `Neighbours` and the rollout have them: by steps."""
+    if isinstance(schedules, Neighbours):
+        return schedules[at]
     return schedules.T.index_select(1, torch.from_numpy(at).to(schedules.device)).T

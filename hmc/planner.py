@@ -266,9 +266,11 @@ def plan(
     try:
         run(search, SOLVERS[solver], math.inf if iterations is None else iterations)
     except KeyboardInterrupt:
+        search.begin()
         search.accept()
         search.stopped_by = "interrupt"
         raise PlanInterrupted(_plan(search, incumbent)) from None
+    search.begin()
     search.evaluator.follow(search.schedule)
     meter.settle()
     for used in (search.evaluator.sim, *(sim for each in task.modes for sim in each.sims)):

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hmc.account import Account
+from hmc.bounds import Rest
 from hmc.branches import Branches, tree_of
 from hmc.cost import total_by_term
 from hmc.neighbours import Neighbours
@@ -20,7 +21,7 @@ from hmc.trace import Floats, Recorder, Traces
 from hmc.worlds import Crew, Flags, Indices, Worlds, finite
 
 ROWS, STEPS = 256, 8  # of states that are priced in one call, at most
-MANY_ROWS = 8192  # where a control step takes less time than such a call, or than to wait for what it finds
+MANY_ROWS = 24576
 RECORDED = 64  # branches that are all recorded, at most
 
 
@@ -113,16 +114,20 @@ class _Rollout:
         self._go_on(slice(0, 0))  # a slice while none has ended
         self.crew: Crew | None = None  # who acts in them; None: to be found out
         # what cannot end a branch on the way is looked at now and then only
-        self.watchful = task.lower_bound is not None or (task.rules is not None and bool(task.rules.guards))
-        # to look at each step's states and inputs is to wait for a GPU: they are judged with what steps cost,
-        # and that is looked at together with what guards and bounds say
-        self.later = far(self.sim.device) and self.stages > 0
-        self.account = Account(task, n * self.members, self.sim.dt, self.recorder, self.later)
+        bounded = task.lower_bound is not None or task.tail_bound is not None
+        self.rest = Rest(task, tree) if bounded and self.limit < math.inf else None
+        self.watchful = self.rest is not None or (task.rules is not None and bool(task.rules.guards))
+        # to look at each step's states and inputs is to wait for a GPU, and takes longer than to go on where
+        # steps are cheap: they are judged with what steps cost, together with what guards and bounds say
+        self.near = not far(self.sim.device)
+        self.later = (self.cheap or not self.near) and self.stages > 0
+        self.account = Account(task, n * self.members, self.sim.dt, self.recorder, self.later, self.near)
         self.constant = task.modes.constants is not None
         self.rows = MANY_ROWS if self.cheap or self.later else ROWS
         # what steps cost can wait where nothing is given up for it
         patient = self.limit == math.inf and not self.later
-        self.at_once = 1 if self.watchful and not self.later else self.rows if patient else STEPS
+        often = self.watchful and not (self.later or self.cheap)
+        self.at_once = 1 if often else self.rows if patient or self.cheap else STEPS
         # what is beyond its limit has no children, where to find out takes less time than to step those
         self.before_births = not (self.cheap or self.later or patient)
 
@@ -140,8 +145,7 @@ class _Rollout:
             self.recorder.arrive(self.worlds, i, self.ids, self.at, x, u_prev)
         look = i == self.horizon or not self.later
         if look and not math.isfinite(float(x.sum())):  # a finite sum has finite parts
-            x, u_prev = self._price(x, u_prev)
-            x, u_prev = self._drop(~self._all(finite(x).cpu().numpy()), x, u_prev)
+            x, u_prev = self._price(x, u_prev, sane=self._all(finite(x).cpu().numpy()))
         if i == self.horizon:
             self._arrive(x, k)
             return
@@ -294,79 +298,83 @@ class _Rollout:
 
     def _price(self, *rows: Tensor, sane: Flags | None = None) -> tuple[Tensor, ...]:
         """Find out what the last steps cost, and end whom `_settle` ends; the `rows` of the others."""
-        if not len(self.account):
+        if len(self.account):
+            self.account.settle(self.account.costs(self.first).cpu().numpy())
+        elif sane is None:
             return rows
-        return self._settle(self.account.costs(self.first).cpu().numpy(), *rows, sane=sane)
-
-    def _settle(self, costs: Floats, *rows: Tensor, sane: Flags | None = None) -> tuple[Tensor, ...]:
-        """Add what the last steps cost, and end the branches that are beyond their limit, no number, or not
-        `sane` (n,); the `rows`, (n E, ...) each, of the others."""
-        self.account.settle(costs)
-        total = total_by_term(self.sums)
-        partial = self._risk(total)
-        if sane is not None or not math.isfinite(total.sum()) or partial.max() > self.limit:
-            fine = self._all(np.isfinite(total))
-            return self._prune(partial, fine if sane is None else fine & sane, *rows)
-        return rows
+        return self._settle(*rows, sane=sane)
 
     def _give_up(self, i: int, x: Tensor, u: Tensor) -> tuple[Tensor, ...]:
         """End what a guard bars and what is sure to exceed its limit; states and inputs of the others.
 
         What is to be known for that is fetched at once, what the last steps cost included.
         """
-        rules, rest, k, there = self.task.rules, self.task.lower_bound, self.first + i, self._indices
-        modes, barred, least = self._each(self.modes[i, self.ids]), None, None
+        rules, k, barred, least = self.task.rules, self.first + i, None, None
         if rules is not None and rules.guards:
+            modes = self._each(self.modes[i, self.ids])
             barred = rules.barred(self.task.modes, modes != self._before(i), modes, x, k)
-        if rest is not None and self.limit < math.inf:
-            least = rest(x, torch.full((len(x),), k, device=x.device), self.horizon - i)
+        if self.rest is not None and (self._due or not self.cheap):
+            least = self.rest(i, self.ids, x, k)
         if barred is None and least is None and not (self.later and self._due):
             return x, u
         costs = self.account.costs(self.first) if len(self.account) else None
-        sane = finite(x) if self.later else None
-        known = fetched(costs, sane, barred, least)
-
-        def of_those_left(numbers: Floats) -> Floats:
-            mine: Floats = numbers.reshape(len(there), -1)[there.searchsorted(self._indices)].ravel()
-            return mine
-
+        look = self.later and not (self.near and math.isfinite(float(x.sum())))
+        known = fetched(costs, finite(x) if look else None, barred, least)
         if costs is not None:
-            x, u = self._settle(known[0].reshape(costs.shape), x, u)
-        if sane is not None:
-            x, u = self._drop(~self._all(of_those_left(known[1]) > 0), x, u)
-        if barred is not None:
-            bad = ~self._all(of_those_left(known[2]) == 0)
-            self.barred[self._indices[bad]] = True
-            x, u = self._drop(bad, x, u)
-        if least is not None and len(x) > 0:
-            bound = total_by_term(self.sums) - self.slack
-            bound += of_those_left(known[3])
-            # hopeless is pruned as well, and a bound that is no number bounds nothing
-            risk = self._risk(np.nan_to_num(bound, nan=0.0, posinf=math.inf, neginf=-math.inf))
-            if risk.max() > self.limit:
-                x, u = self._prune(risk, np.ones(len(risk), dtype=bool), x, u)
-        return x, u
+            self.account.settle(known[0])
+        return self._settle(
+            x,
+            u,
+            sane=self._all(known[1] > 0) if look else None,
+            barred=None if barred is None else ~self._all(known[2] == 0),
+            least=None if least is None else known[3],
+        )
 
-    def _prune(self, cost: Floats, sane: Flags, *rows: Tensor) -> tuple[Tensor, ...]:
-        """End branches whose cost so far is beyond the limit, and those not `sane` (n,); as `_drop`."""
+    def _settle(
+        self,
+        *rows: Tensor,
+        sane: Flags | None = None,
+        barred: Flags | None = None,
+        least: Floats | None = None,
+    ) -> tuple[Tensor, ...]:
+        """End the branches that cost more than the limit or no number, those not `sane` (n,), those `barred`
+        (n,), and those that the `least` (n E,) that is still to come takes beyond the limit; the `rows`,
+        (n E, ...) each, of the others."""
+        total, there = total_by_term(self.sums), self._indices
+        fine = np.ones(self.size, dtype=bool) if sane is None else sane
+        if not math.isfinite(total.sum()):
+            fine = fine & self._all(np.isfinite(total))
+        cost = self._risk(total)
         beyond = cost > self.limit
-        if len(self.kept) > 0 and beyond.any():
-            beyond &= ~np.isin(self._indices, self.kept)
-        given_up = self._indices[sane & beyond]
-        self.result[given_up], self.pruned[given_up] = cost[sane & beyond], True
-        return self._drop(~sane | beyond, *rows)
+        over = beyond
+        if least is not None:
+            bound = total - self.slack + least
+            bound[np.isnan(bound)] = 0.0  # what is no number bounds nothing
+            cost = np.where(beyond, cost, self._risk(bound))
+            over = cost > self.limit
+        if len(self.kept) > 0 and over.any():
+            free = ~np.isin(there, self.kept)
+            beyond, over = beyond & free, over & free
+        gone = over | ~fine
+        if barred is not None:
+            stopped = barred & fine & ~beyond
+            self.barred[there[stopped]] = True
+            over, gone = over & ~stopped, gone | stopped
+        if not gone.any():
+            return rows
+        over = over & fine
+        self.result[there[over]], self.pruned[there[over]] = cost[over], True
+        return self._drop(gone, *rows)
 
     def _drop(self, bad: Flags, *rows: Tensor) -> tuple[Tensor, ...]:
         """End those branches that are `bad` (n,); of `rows`, (n E, ...) each, those of the others."""
-        if bad.any():
-            good = np.flatnonzero(self._each(~bad))
-            self.account.keep(good)
-            self._go_on(self._indices[~bad])
-            chosen = self._device(good)
-            if self.cheap:  # to close up takes less time than to pick them out at every step
-                self.worlds.branch(chosen, self.at)
-            rows = tuple(each.index_select(0, chosen) for each in rows)
-        return rows
+        good = np.flatnonzero(self._each(~bad))
+        self.account.keep(good)
+        self._go_on(self._indices[~bad])
+        chosen = self._device(good)
+        if self.cheap:  # to close up takes less time than to pick them out at every step
+            self.worlds.branch(chosen, self.at)
+        return tuple(each[chosen] for each in rows)
 
 
 def far(device: torch.device) -> bool:
@@ -375,8 +383,10 @@ def far(device: torch.device) -> bool:
 
 
 def fetched(*numbers: Tensor | None) -> list[Floats]:
-    """Tensors of a device, flat and in double precision, in one copy; nothing for None."""
-    given = [each if each is None else each.to(torch.float64).flatten() for each in numbers]
-    sizes = [0 if each is None else len(each) for each in given]
-    here = torch.cat([each for each in given if each is not None]).cpu().numpy()
-    return np.split(here, np.cumsum(sizes)[:-1])
+    """Tensors of a device in double precision, in one copy; nothing for None."""
+    given = [np.empty(0) if each is None else each.to(torch.float64) for each in numbers]
+    if not any(far(each.device) for each in numbers if each is not None):
+        return [each if isinstance(each, np.ndarray) else each.numpy() for each in given]
+    flat = torch.cat([each.flatten() for each in given if isinstance(each, Tensor)]).cpu().numpy()
+    parts = np.split(flat, np.cumsum([0 if each is None else each.numel() for each in numbers])[:-1])
+    return [part.reshape(each.shape) for part, each in zip(parts, given, strict=True)]

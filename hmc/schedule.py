@@ -264,18 +264,28 @@ class TailsFirst:
 
 
 class InOrder:
-    """Indices 0 <= index < size, ascending, with the interface of `Draws`."""
+    """Every index 0 <= index < size, ascending, after some that come first; the interface is that of `Draws`.
 
-    def __init__(self, size: int):
-        self._size = size
-        self._taken = 0
+    Args:
+        size: of the range.
+        first: what comes first, in a batch of its own.
+    """
+
+    def __init__(self, size: int, first: Sequence[int] = ()):
+        self._first = torch.tensor(first, dtype=torch.long)
+        later = torch.ones(size, dtype=torch.bool)
+        later[self._first] = False
+        self._later = later.nonzero()[:, 0]
 
     @property
     def left(self) -> int:
         """How many indices have not been taken yet."""
-        return self._size - self._taken
+        return len(self._first) + len(self._later)
 
     def take(self, n: int) -> Tensor:
-        """The next n indices, or all that are left if fewer, (n,) long."""
-        first, self._taken = self._taken, self._taken + min(n, self.left)
-        return torch.arange(first, self._taken)
+        """The next n indices or fewer, (n,) long: at least one, if any is left."""
+        if len(self._first) > 0:
+            taken, self._first = self._first[:n], self._first[n:]
+        else:
+            taken, self._later = self._later[:n], self._later[n:]
+        return taken

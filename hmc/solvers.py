@@ -17,6 +17,7 @@ from hmc.neighbours import Neighbours
 from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
 
 Pairs = list[tuple[Switch, ...]]
+SCOUTS = 96  # draws that come before all others are tried, where they find out what can be given up
 
 
 @dataclass
@@ -35,7 +36,7 @@ class Search:
         moves: draws beside each batch that move a stretch of the schedule.
         max_samples: size that batches of one iteration double to; N throughout if that is larger.
         report: told after every batch and accepted switch; False ends the search.
-        costs: the incumbent's cost, then the cost after each accepted switch or pair.
+        costs: the incumbent's cost once it is known, then the cost after each accepted switch or pair.
         switches: accepted switches.
         seen: how many switches of `schedule` were evaluated and do not improve it.
         stopped_by: why the search ended; None while it runs.
@@ -61,20 +62,24 @@ class Search:
 
     def __post_init__(self) -> None:
         self.space = SwitchSpace(len(self.evaluator.task.modes), len(self.schedule))
-        self.costs.append(self.evaluator.follow(self.schedule))
 
     @property
     def bound(self) -> float:
         """What a switch has to get below: the best one found, else the schedule's cost less the tolerance."""
         if self._found is not None:
             return self._found[1]
-        cost = self.costs[-1]
+        cost = self.costs[-1] if self.costs else math.inf
         return cost - self.tolerance * abs(cost) if math.isfinite(cost) else cost
 
     @property
     def found(self) -> bool:
         """Whether there is something to accept."""
         return self._found is not None
+
+    def begin(self) -> None:
+        """Find out what the incumbent costs, if that is not known yet."""
+        if not self.costs:
+            self.costs.append(self.evaluator.follow(self.schedule))
 
     def batches(
         self, order: Draws | TailsFirst | InOrder, beside: bool = False
@@ -85,7 +90,10 @@ class Search:
         of that: see `hmc.moves`. All of it is rolled out together, which takes least time.
         """
         waiting, size = torch.empty(0, dtype=torch.long), self.samples
-        self.evaluator.follow(self.schedule)
+        if self.costs:
+            self.evaluator.follow(self.schedule)
+        else:
+            self.evaluator.aim(self.schedule)
         while order.left > 0 or len(waiting) > 0:
             waiting = torch.cat([waiting, order.take(size - len(waiting))])
             room, limit = self.meter.room(len(waiting))
@@ -109,6 +117,7 @@ class Search:
             indices, waiting, self._largest = waiting[:room], waiting[room:], max(self._largest, room)
             pairs = pairs[: max(0, affordable - room)]
             costs = self._roll(batch[: room + len(pairs)])
+            self.begin()
             known = ~costs.isnan()
             self.seen += int(known[:room].sum())
             found = torch.where(known, costs, math.inf)
@@ -119,9 +128,12 @@ class Search:
             size = max(self.samples, min(2 * size, self.max_samples))
             self.tell()
 
-    def offer(self, switches: Sequence[Switch], cost: float) -> None:
-        """Take note of one switch, or of some that are stitched one after the other, if below `bound`."""
-        if cost < self.bound:
+    def offer(self, switches: Sequence[Switch], cost: float, replace: bool = False) -> None:
+        """Take note of one switch, or of some that are stitched one after the other, if below `bound`.
+
+        With `replace`, also of what costs the same as what was noted before.
+        """
+        if cost < self.bound or (replace and self.found and cost == self.bound):
             self._found = tuple(switches), cost
 
     def _pairs(self, ahead: int) -> Pairs:
@@ -167,6 +179,7 @@ def sample(search: Search) -> None:
 
     The batch's best is taken, not its first: the whole batch has been rolled out by then.
     """
+    search.begin()
     draws = ORDERS[search.order](search)
     for indices, costs, pairs, theirs in search.batches(draws, beside=True):
         best = costs.argmin()
@@ -179,10 +192,25 @@ def sample(search: Search) -> None:
 
 
 def exhaustive(search: Search) -> None:
-    """Problem 5 solved exactly: the best of all of Omega; of equal ones, that of lowest index."""
-    for indices, costs, _, _ in search.batches(InOrder(len(search.space))):
-        best = costs.argmin()
-        search.offer([search.space[int(indices[best])]], float(costs[best]))
+    """Problem 5 solved exactly: the best of all of Omega; of equal ones, that of lowest index.
+
+    Where a task bounds what is left of a rollout, a few draws come first: most of the others can be given up
+    soon then.
+    """
+    size, task = len(search.space), search.evaluator.task
+    first: list[int] = []
+    bounded = task.cost.nonnegative and (task.lower_bound is not None or task.tail_bound is not None)
+    if bounded and min(size, search.samples) >= 8 * SCOUTS:
+        first = sorted(Draws(size, search.rng).take(SCOUTS).tolist())
+    else:
+        search.begin()
+    lowest = math.inf, size
+    for indices, costs, _, _ in search.batches(InOrder(size, first)):
+        best = int(costs.argmin())
+        here = float(costs[best]), int(indices[best])
+        if here < lowest:
+            lowest = here
+            search.offer([search.space[here[1]]], here[0], replace=True)
 
 
 def _tails(search: Search) -> TailsFirst:

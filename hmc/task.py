@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hmc.cost import Cost
 from hmc.ensemble import Ensemble
-from hmc.modes import ModeSet
+from hmc.modes import Mode, ModeSet
 from hmc.rules import Rules
 from hmc.sim.base import Sim
 
@@ -28,6 +28,9 @@ class Task:
         lower_bound: f(x, k, steps) -> (n,), at most what any schedule costs from states x (n, nx) at control
             steps k (n,) over the `steps` that are left, terminal cost included: rollouts that cannot get
             below the best known cost end sooner. Used where the cost says that it is non-negative.
+        tail_bound: f(mode, x, k, steps) -> (n,), the same where one mode runs to the end, as it does in most
+            of what a search rolls out; None where nothing is known of that mode. Either bound holds for
+            every model of an ensemble. Who replaces the cost or the simulator replaces the bounds as well.
         ensemble: models that schedules are judged on in place of one from `make_sim`; None for that one.
     """
 
@@ -38,6 +41,7 @@ class Task:
     make_sim: Callable[[int], Sim]
     rules: Rules | None = None
     lower_bound: Callable[[Tensor, Tensor, int], Tensor] | None = None
+    tail_bound: Callable[[Mode, Tensor, Tensor, int], Tensor | None] | None = None
     ensemble: Ensemble | None = None
 
     def __post_init__(self) -> None:

@@ -39,6 +39,8 @@ class Worlds:
     def __init__(self, task: Task, sim: Sim):
         self.task, self.sim, self.cheap = task, sim, bool(getattr(sim, "cheap", False))
         self.own_steps = self.nested_steps = 0
+        constants = task.modes.constants
+        self._held = np.empty((0, sim.nu)) if constants is None else constants[:, None].repeat(sim.nu, 1)
         self._all = torch.arange(sim.num_worlds, device=sim.device)
         self.memory = torch.zeros(sim.num_worlds, task.modes.memory_size, dtype=sim.dtype, device=sim.device)
 
@@ -81,8 +83,7 @@ class Worlds:
             before: the modes that ran last, (n,); -1 for none. One that did not run before is entered first.
         """
         if self.task.modes.constants is not None:
-            held = upload(self.task.modes.constants.take(modes), self.sim.device).to(self.sim.dtype)
-            return Crew(len(modes), [], held[:, None].expand(-1, self.sim.nu))
+            return Crew(len(modes), [], upload(self._held.take(modes, 0), self.sim.device).to(self.sim.dtype))
         new, count = modes != before, np.bincount(modes)
         indices = count.nonzero()[0].tolist()
         if len(indices) == 1:

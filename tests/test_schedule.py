@@ -186,6 +186,14 @@ def test_in_order():
     assert order.left == 0
 
 
+def test_in_order_after_some_that_come_first():
+    order, taken = InOrder(6, [1, 4]), []
+    while order.left > 0:
+        taken.append(order.take(3).tolist())
+    assert taken == [[1, 4], [0, 2, 3], [5]]
+    assert [InOrder(6, [1, 4]).take(1).tolist(), InOrder(0).take(3).tolist()] == [[1], []]
+
+
 @given(num_modes=st.integers(1, 4), horizon=st.integers(1, 12), n=st.integers(1, 40), seed=st.integers(0, 99))
 def test_tails_first_takes_every_switch_once_and_the_tails_before_the_rest(num_modes, horizon, n, seed):
     space = SwitchSpace(num_modes, horizon)

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hmc import Schedule, SwitchSpace
 from hmc.table import Table
 
 
@@ -25,6 +26,24 @@ def test_rows_are_equal_where_schedules_are(num_modes, data):
         for b, other in zip(rows, schedules, strict=True):
             assert (a == b) == (one == other)
     assert table.rows(torch.tensor(schedules[::-1])).tolist() == rows[::-1]
+
+
+@given(data=st.data(), num_modes=st.integers(2, 6), horizon=st.integers(1, 9))
+def test_neighbours_have_the_rows_of_their_schedules(data, num_modes, horizon):
+    mode = st.integers(0, num_modes - 1)
+    base = Schedule(tuple(data.draw(st.lists(mode, min_size=horizon, max_size=horizon))))
+    space = SwitchSpace(num_modes, horizon)
+    switched = space.neighbours(base, torch.arange(len(space)))
+    table, schedules = Table(num_modes, 1), switched.tensor()
+    rows = table.rows(switched)
+    np.testing.assert_array_equal(table.rows(schedules), rows)
+    distinct = {tuple(schedule) for schedule in schedules.tolist()}
+    assert len(set(rows.tolist())) == len(distinct)
+
+
+def test_a_million_schedules_have_a_million_rows():
+    every = torch.cartesian_prod(*[torch.arange(10, dtype=torch.uint8)] * 6)
+    assert len(np.unique(Table(10, 1).rows(every))) == 10**6
 
 
 def test_a_pruned_cost_answers_only_those_who_have_no_use_for_it():
