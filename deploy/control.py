@@ -71,6 +71,7 @@ class Control:
         self._from, self._ramp_began = _ZERO, 0  # where it begins [rad], and when [ms]
         self._frame: bytes | None = None
         self._fault = ""
+        self._heard: float | None = None  # when the state came that `settle` has yet to look at [s]
         self._anew = False  # whether the estimator has begun anew since the robot stands
 
     @property
@@ -79,14 +80,43 @@ class Control:
         return self.machine.phase
 
     def hear(self, frame: bytes, now: float) -> bool:
-        """Take a state frame that came `now` [s]; whether it made a tick."""
+        """Take a state frame that came `now` [s], all of it; whether it made a tick."""
+        ticked = self.react(frame, now)
+        self.settle()
+        return ticked
+
+    def react(self, frame: bytes, now: float) -> bool:
+        """Take a state frame that came `now` [s], and command what a tick asks for; whether it made one.
+
+        What takes longer, and a command can do without, is left to `settle`, which has to follow.
+        """
         state = self.checks.take(frame, now)
         if state is None:
             self.idle(now)
             return False
-        self.state, ms = state, self.checks.ms
+        self.state, ms, self._heard = state, self.checks.ms, now
+        if self._first < 0:
+            self._first = ms
+        if (due := (ms - self._first) // TICK) <= self.k:
+            return False
+        x = None
+        if self.phase == Phase.HYBRID:
+            x = self.estimator.ahead(0.001 * ms, state.gyro, state.acc, state.q, state.dq)
+            if x is None:  # a reading is missing, or came late: the estimate comes first
+                self.settle()
+                x = None if self.estimate is None else self.estimate.x
+        self.missed += due - self.k - 1
+        self.k = due
+        self._tick(x)
+        return True
+
+    def settle(self) -> None:
+        """What the last state means for the estimate, and both for the phase."""
+        if self._heard is None or self.state is None:
+            return
+        state, now, self._heard = self.state, self._heard, None
         self.estimate = self.estimator.update(
-            0.001 * ms,
+            0.001 * self.checks.ms,
             state.gyro,
             state.acc,
             state.q,
@@ -94,18 +124,12 @@ class Control:
             state.tau,
             state.foot_force.astype(np.float64),
         )
+        if self.estimate is not None:
+            self.situation["x"] = self.estimate.x
         fault = self._fault or self.checks.fault(now) or self._outside(state)
         if self.phase == Phase.PASSIVE:
             fault = fault or self.wait
         self._step(Inputs(unpack(state.remote).buttons, fault, self._posed(), self._settled(), self.planner))
-        if self._first < 0:
-            self._first = ms
-        if (due := (ms - self._first) // TICK) <= self.k:
-            return False
-        self.missed += due - self.k - 1
-        self.k = due
-        self._tick()
-        return True
 
     def idle(self, now: float) -> None:
         """No frame came that is believed."""
@@ -144,14 +168,15 @@ class Control:
         if phase == Phase.DAMPING:
             self._frame = self._encode(_ZERO, 0.0, self.cfg.output.damping)
 
-    def _tick(self) -> None:
-        """Command this control step."""
+    def _tick(self, x: Array | None) -> None:
+        """Command this control step, in which the state is x (37,); only modes ask for it."""
         phase = self.phase
         if phase in (Phase.PASSIVE, Phase.DAMPING):
             return
         try:
             if phase == Phase.HYBRID:
-                wanted, kp, kd = self._perform(), facts.KP, facts.KD
+                assert x is not None
+                wanted, kp, kd = self._perform(x), facts.KP, facts.KD
             else:
                 assert self._ramp is not None
                 wanted, kp, kd = self._ramped(), self._ramp.kp, self._ramp.kd
@@ -161,21 +186,14 @@ class Control:
             return
         self._frame = self._encode(self.target, kp, kd)
 
-    def _perform(self) -> Array:
-        """What the plan's mode wants; what a planner has to know is taken down before."""
-        performer, estimate, now = self.performer, self.estimate, self.situation
-        assert estimate is not None
+    def _perform(self, x: Array) -> Array:
+        """What the plan's mode wants in state x; what a planner has to know is taken down before."""
+        performer, now = self.performer, self.situation
         performer.take_over(self.k)
-        now["k"], now["x"], now["u"], now["asked"], now["running"] = (
-            self.k,
-            estimate.x,
-            self.target,
-            self.asked,
-            1,
-        )
+        now["k"], now["u"], now["asked"], now["running"] = self.k, self.target, self.asked, 1
         now["mode"], now["entered"], now["anchor"] = performer.mode, performer.entered, performer.anchor
         now["plan"] = performer.plan.number if performer.plan else 0
-        return performer.act(self.k, estimate.x, self.target)
+        return performer.act(self.k, x, self.target)
 
     def _ramped(self) -> Array:
         """Where the slow motion is now; its speed is zero at both ends."""

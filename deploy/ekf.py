@@ -35,9 +35,8 @@ to, is
 .. math::
     0 = C s_i + r + c \, n_i e_z - p_i
 
-The compliance is found out, too: the feet of a stance take the load in turns.
-
-Feet that do not stand are kept out: their covariance is 1 m^2, uncorrelated.
+The compliance is found out, too: the feet of a stance take the load in turns. Feet that do not stand are kept
+out: their covariance is 1 m^2, uncorrelated.
 
 **What nobody can know.** No reading tells heading and place, so that nothing must be learnt of them: an error
 phi = e_z goes with errors e_z x v, e_z x r and e_z x p of the rest, a direction that moves with the estimate
@@ -194,11 +193,9 @@ class Ekf:
             change: of the readings since the last step, gyroscope's then accelerometer's, (6,).
         """
         w, f = gyro - self.bw, acc - self.bf
-        phi = w * dt + self.late * change[:3]
+        phi, dv, dr = self._motion(w, f, dt, change)
         roll = (phi + turn) @ self.C.T
         rows = roll.tolist()
-        first, second = so3.carried(phi, f)
-        dv, dr = self.C @ (dt * first), self.C @ (dt * dt * second)
         F = self.transition(dv, dr, rows, change[:3], dt)
         np.matmul(F, self.P, out=self._FP)
         P = np.matmul(self._FP, F.T)
@@ -216,17 +213,29 @@ class Ekf:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P
 
-        dv[2] -= GRAVITY * dt
-        dr[2] -= 0.5 * GRAVITY * dt * dt
-        self.r = self.r + dr + dt * self.v
-        self.v = self.v + dv
         for leg, stands in enumerate(self.stands.tolist()):
             if stands:
                 (x, y, _), at = rows[leg], foot(leg).start
                 self.p[leg, 0] += FOOT_RADIUS * y + self.spin * F[at, SPIN]
                 self.p[leg, 1] -= FOOT_RADIUS * x - self.spin * F[at + 1, SPIN]
         self.spin *= float(F[SPIN, SPIN])
-        self.q, self.C = so3.turned(self.q, phi)
+        self.r, self.v, self.q, self.C = self._moved(phi, dv, dr, dt)
+
+    def ahead(self, gyro: Array, acc: Array, dt: float, change: Array) -> tuple[Array, Array, Array, Array]:
+        """r, v, q and C as `predict` will leave them; arguments as there."""
+        return self._moved(*self._motion(gyro - self.bw, acc - self.bf, dt, change), dt)
+
+    def _motion(self, w: Array, f: Array, dt: float, change: Array) -> tuple[Array, Array, Array]:
+        """What rate and specific force turn in the body frame, speed up and shift in the world, (3,) each."""
+        phi = w * dt + self.late * change[:3]
+        first, second = so3.carried(phi, f)
+        return phi, self.C @ (dt * first), self.C @ (dt * dt * second)
+
+    def _moved(self, phi: Array, dv: Array, dr: Array, dt: float) -> tuple[Array, Array, Array, Array]:
+        """r, v, q and C after a step of `_motion`; dv and dr are used up."""
+        dv[2] -= GRAVITY * dt
+        dr[2] -= 0.5 * GRAVITY * dt * dt
+        return self.r + dr + dt * self.v, self.v + dv, *so3.turned(self.q, phi)
 
     def _walk(self, w: Array, f: Array, roll: Rows, dt: float, hidden: float, loose: Rows) -> list[float]:
         """Diagonal of the step's noise, 30; `hidden` is the time [s^2] in which changes went unseen."""

@@ -166,6 +166,20 @@ class Estimator:
         self._estimate = self._output(used)
         return self._estimate
 
+    def ahead(self, t: float, gyro: Array, acc: Array, q: Array, qd: Array) -> Array | None:
+        """The state (37,) at readings that `update` has yet to take, from the last estimate by the IMU alone.
+
+        It takes a fraction of the time. None where `update` would not move on by one period from readings
+        to readings: arguments as there.
+        """
+        dt, period = t - self._t, self.cfg.period
+        if self._estimate is None or self._good != self._t or abs(dt - period) > 0.1 * period:
+            return None
+        if not (self._readable(gyro, acc) and math.isfinite(float(q.sum() + qd.sum()))):
+            return None
+        place, v, quat, C = self.ekf.ahead(gyro, acc, dt, np.concatenate([gyro, acc]) - self._imu)
+        return self._state(place, v, quat, C, gyro - self.ekf.bw, q.tolist(), qd.tolist())
+
     def _lies(self, dt: float) -> bool:
         """Whether the body rests on something else than its feet; then its velocity is 0."""
         if self._carried:
@@ -326,18 +340,11 @@ class Estimator:
         return distance(A, u) < cfg.slip_gate
 
     def _output(self, used: Flags) -> Estimate:
-        """The estimate of the base, from that of the IMU."""
+        """The estimate at the last tick."""
         ekf = self.ekf
-        w = self._imu[:3] - ekf.bw
-        a, b, c = w.tolist()
-        x, y, z = _IMU
-        arm = np.array([(x, b * z - c * y), (y, c * x - a * z), (z, a * y - b * x)])
-        base = ekf.C @ arm  # the IMU and its velocity, seen from the base
-        place, velocity = ekf.r - base[:, 0], ekf.v - base[:, 1]
-        state = [*place.tolist(), *ekf.q.tolist(), *self._q, *velocity.tolist(), a, b, c, *self._qd]
         return Estimate(
             self._t,
-            np.array(state),
+            self._state(ekf.r, ekf.v, ekf.q, ekf.C, self._imu[:3] - ekf.bw, self._q, self._qd),
             ekf.C,
             ekf.bw,
             ekf.bf,
@@ -346,3 +353,14 @@ class Estimator:
             ekf.P.copy(),
             self.cfg.noise.gyro,
         )
+
+    def _state(
+        self, r: Array, v: Array, quat: Array, C: Array, w: Array, q: list[float], qd: list[float]
+    ) -> Array:
+        """The base's state (37,) from place and velocity of the IMU, attitude, rate and joints."""
+        a, b, c = w.tolist()
+        x, y, z = _IMU
+        arm = np.array([(x, b * z - c * y), (y, c * x - a * z), (z, a * y - b * x)])
+        base = C @ arm  # the IMU and its velocity, seen from the base
+        place, velocity = r - base[:, 0], v - base[:, 1]
+        return np.array([*place.tolist(), *quat.tolist(), *q, *velocity.tolist(), a, b, c, *qd])

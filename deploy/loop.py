@@ -116,18 +116,22 @@ class Loop:
         self._listen(now)
         ticked = False
         for frame in frames:
-            ticked = control.hear(frame, now) or ticked
-            self._recorder.add(STATE, frame)
+            control.settle()  # the one before
+            ticked = control.react(frame, now) or ticked
         if not frames:
             control.idle(now)
-        command = control.command
-        if command is not None and self._commands is not None and not self._silent:
-            self._commands.write(command)
+        sent = self._send()
         left = time.monotonic()
+        control.settle()
+        command = control.command
+        if command != sent:  # it damps
+            self._send()
         heart = board.heart.blank()
         heart["t"], heart["commanding"] = left, command is not None and not self._dry_run
         heart["latched"], heart["reason"] = control.phase == Phase.DAMPING, text(control.machine.reason)
         board.heart.write(heart)
+        for frame in frames:
+            self._recorder.add(STATE, frame)
         if command is not None and command != self._logged:
             self._recorder.add(COMMAND, command)
             self._logged = command
@@ -143,6 +147,13 @@ class Loop:
             self._phase, self._hint = control.phase, control.machine.hint
             why = control.machine.reason or self._hint
             self._recorder.event("phase", phase=self._phase.name.lower(), k=control.k, reason=why)
+
+    def _send(self) -> bytes | None:
+        """Send the command, if there is one; it."""
+        command = self._control.command
+        if command is not None and self._commands is not None and not self._silent:
+            self._commands.write(command)
+        return command
 
     def _listen(self, now: float) -> None:
         """Read what the watchdog has to say, and whether a planner is there."""

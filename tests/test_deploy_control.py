@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
 
 from deploy.codec import VELOCITY_STOP, RobotState, decode_command, decode_state, encode_state
-from deploy.control import Control
-from deploy.loop import policies
+from deploy.control import TICK, Control
+from deploy.log import Recorder
+from deploy.loop import Loop, policies
 from deploy.remote import Button, Remote, pack
 from deploy.safety import PEAK_TORQUE, Phase
 from deploy.settings import DeployCfg
+from deploy.slots import Board
 from hmc.cfg import load
 from hmc.go2.network import LOWER, UPPER
 from hmc.go2.stances import FOOTSTAND
@@ -189,6 +193,90 @@ def test_every_fault_in_every_phase_is_safe_within_100_ms(met: Met, phase: Phase
         motors = decode_command(control.command).motors
         assert not motors.kp.any()
         assert (motors.kd == 5.0).all()
+
+
+def test_a_command_does_not_wait_for_the_estimator(met: Met):
+    """It is for the state by the IMU alone; with what the feet say it is hardly another one."""
+    control, frames = duplicate(met[Phase.HYBRID][0]), met[Phase.HYBRID][1]
+    patient = duplicate(control)
+    now, ticks = control.checks.heard, 0
+    for frame in frames:
+        now += 0.002
+        before = control.estimate
+        with mock.patch.object(patient.estimator, "ahead", return_value=None):
+            assert control.react(frame, now) == patient.hear(frame, now)
+        assert control.estimate is before, "that comes later"
+        assert control.k == patient.k
+        ticks += control.k * TICK == control.checks.ms - control._first
+        np.testing.assert_allclose(control.target, patient.target, atol=0.02)
+        control.settle()
+        estimate = control.estimate
+        assert estimate is not None
+        assert estimate.t == 0.001 * control.checks.ms
+        control.settle()
+        assert control.estimate is estimate, "once a state"
+    assert ticks == 10
+
+
+class Wire:
+    """Frames in, commands out: a link and a subscriber at once."""
+
+    def __init__(self) -> None:
+        self.frames: list[bytes] = []
+        self.sent: list[bytes] = []
+
+    def take(self, timeout: float = 0.0) -> list[bytes]:
+        taken, self.frames = self.frames, []
+        return taken
+
+    def write(self, command: bytes) -> None:
+        self.sent.append(command)
+
+    def publisher(self, topic: str, kind: type) -> Wire:
+        return self
+
+    def rivals(self, topic: str, ours: tuple[int, ...] = ()) -> list[str]:
+        return []
+
+
+def test_what_the_estimator_finds_out_is_sent_at_once(met: Met):
+    """The command of a tick is on its way by then; the damping follows it without another frame."""
+    control, frames = duplicate(met[Phase.HYBRID][0]), met[Phase.HYBRID][1]
+    wire, board = Wire(), Board()
+    loop = Loop(wire, wire, board, control, Recorder(-1), dry_run=False)
+    beat = board.guard.blank()
+    for frame in frames[:40]:
+        beat["t"] = time.monotonic()
+        board.guard.write(beat)
+        wire.frames = [frame]
+        loop.turn()
+        assert control.phase == Phase.HYBRID, control.machine.reason
+    assert len(wire.sent) == 40
+    order: list[str] = []
+    settle, write = control.settle, wire.write
+
+    def settling() -> None:
+        order.append("settle")
+        settle()
+
+    def writing(command: bytes) -> None:
+        order.append("write")
+        write(command)
+
+    with (
+        mock.patch.object(control, "settle", settling),
+        mock.patch.object(wire, "write", writing),
+        mock.patch.object(control, "_outside", return_value="too far over"),
+    ):
+        beat["t"] = time.monotonic()
+        board.guard.write(beat)
+        wire.frames = [frames[40]]
+        loop.turn()
+    assert order == ["settle", "write", "settle", "write"]
+    assert control.phase == Phase.DAMPING
+    assert decode_command(wire.sent[-2]).motors.kp.any()
+    assert not decode_command(wire.sent[-1]).motors.kp.any()
+    board.close()
 
 
 def test_single_bad_frames_disturb_nothing():
