@@ -103,7 +103,7 @@ def fan(switched: Neighbours, trunk: Sequence[int], beside: bool) -> Branches:
         if len(along) > 0:
             birth[along], stems = _parted(_steps(switched[along].tensor()), trunk)
             parent[along] = np.where(stems < 0, -1, along[stems] + beside)
-    calm = int(_last(np.array(base)[:, None])[0])
+    calm = next((i for i in range(horizon - 1, 0, -1) if base[i] != base[i - 1]), 0)
     last = np.where(stop < horizon, np.maximum(stop, calm), start)
     if beside:
         birth, parent, last = np.r_[apart, birth], np.r_[-1, parent], np.r_[calm, last]

@@ -29,7 +29,8 @@ class Evaluator:
 
     A schedule's cost does not depend on which others are evaluated with it, in which order, or in how
     large a simulator. A world whose state, input or cost stops being finite costs inf, is counted, and is
-    not stepped any more. Results are kept: an equal schedule is never rolled out twice.
+    not stepped any more. Results are kept: an equal schedule is never rolled out twice, but for one that
+    others are built on, see `aim`.
 
     Schedules that begin alike share the rollout of their beginning: with the one that `follow` recorded,
     and with each other as far as they fit into the simulator together.
@@ -63,6 +64,7 @@ class Evaluator:
         if known is not None and len(self._trunk) == 1 and known.meets(self.trunk):
             self._trunk = (known,)
         self._next: Schedule | None = None  # to be recorded with the next batch
+        self._again = False  # it is rolled out with each batch in place of that
         self._traces: dict[int, Callable[[], Traces]] = {}  # of the last batch, where they were kept
         self._table = Table(len(task.modes), len(task.cost.names))
 
@@ -129,14 +131,19 @@ class Evaluator:
             size = self.size - len(beside)
             chunk = todo[first : first + size]
             modes = beside[0].modes if beside else None
-            rolled = roll(self._worlds, self._trunk, _some(schedules, chunk), bound, stop, modes)
+            recorded, ahead = (None, modes) if self._again else (modes, None)
+            some = _some(schedules, chunk)
+            rolled = roll(self._worlds, self._trunk, some, bound, stop, recorded, ahead)
             if rolled is None:
                 break
             if rolled.trace is not None and self._next is not None:
                 followed, self._trunk, self._next = self._next, rolled.trace, None
                 self._know(followed)
-            self._learn(rows[chunk], rolled)
-            self._keep(rows[chunk], rolled)
+            named = rows[chunk]
+            if ahead is not None:
+                named = np.concatenate([self._table.rows(beside[0].tensor()[None]), named])
+            self._learn(named, rolled)
+            self._keep(named, rolled)
             first += size
         return torch.from_numpy(self._table.costs(rows, bound))
 
@@ -171,6 +178,7 @@ class Evaluator:
         is recorded together with the next batch, which costs as many control steps as alone and less time.
         """
         rows = self._table.rows(schedule.tensor()[None])
+        self._again = self._again and schedule == self._next
         if not self._table.missing(rows, math.inf)[0]:
             cost = float(self._table.costs(rows, math.inf)[0])
             if math.isfinite(cost) and int(rows[0]) in self._traces:
@@ -185,12 +193,15 @@ class Evaluator:
         return self._know(schedule)
 
     def aim(self, schedule: Schedule) -> None:
-        """As `follow`, but a schedule of unknown cost is rolled out beside the next batch, if it has room."""
+        """As `follow`, but a schedule of unknown cost is rolled out beside the next batch, if it has room.
+
+        Where steps are cheap beside all batches that are built on it: to record it takes longer.
+        """
         rows = schedule.tensor()[None]
         if self.size == 1 or not self._table.missing(self._table.rows(rows), math.inf)[0]:
             self.follow(schedule)
         elif len(self._allowed(np.array([0]), self._table.rows(rows), rows)) > 0:
-            self._next = schedule
+            self._next, self._again = schedule, self._worlds.cheap
 
     @torch.no_grad()
     def record(self) -> None:
@@ -263,12 +274,16 @@ class Evaluator:
         return float(self._table.costs(rows, math.inf)[0])
 
     def _learn(self, rows: Rows, rolled: Rolled) -> None:
-        self.rollouts += len(rows)
-        self.diverged += int(rolled.diverged.sum())
-        self.pruned += int(rolled.pruned.sum())
-        self.ruled_out += int(rolled.barred.sum())
-        cost, pruned, terms = (part.cpu().numpy() for part in (rolled.cost, rolled.pruned, rolled.terms))
-        self._table.learn(rows, cost, pruned, terms)
+        """Take down what came of (n,) rows; the first one may be known."""
+        known = 0 if self._table.missing(rows[:1], math.inf)[0] else 1
+        ends = (rolled.diverged, rolled.pruned, rolled.barred)
+        diverged, pruned, barred = (part[known:].cpu().numpy() for part in ends)
+        self.rollouts += len(rows) - known
+        self.diverged += int(diverged.sum())
+        self.pruned += int(pruned.sum())
+        self.ruled_out += int(barred.sum())
+        cost, terms = rolled.cost[known:].cpu().numpy(), rolled.terms[known:].cpu().numpy()
+        self._table.learn(rows[known:], cost, pruned, terms)
 
 
 def _spelt(schedules: Tensor | Neighbours) -> Tensor:

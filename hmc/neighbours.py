@@ -43,8 +43,9 @@ class Neighbours:
     def of(cls, base: Schedule, num_modes: int, mode: Indices, start: Indices, stop: Indices) -> Neighbours:
         """Those of switches into `mode` (n,) from step `start` (n,) on, up to `stop` (n,)."""
         horizon, other = len(base), _other(base, num_modes)
-        first = _next(other)[mode, start]
-        end = horizon - _next(other[:, ::-1])[mode, horizon - stop]
+        at = mode * (horizon + 1)
+        first = _next(other).take(at + start)
+        end = horizon - _next(other[:, ::-1]).take(at + (horizon - stop))
         none = first >= end
         return cls(
             base,
@@ -63,8 +64,8 @@ class Neighbours:
     @cached_property
     def changed_next(self) -> Indices:
         """The first step from each `stop` on that has another mode than the switch, T if none has, (n,)."""
-        found: Indices = _next(_other(self.base, self.num_modes))[self.mode, self.stop]
-        return found
+        after = _next(_other(self.base, self.num_modes))
+        return after.take(self.mode * after.shape[1] + self.stop)
 
     def tensor(self) -> Tensor:
         """The schedules, (n, T), in a type that fits and laid out by steps."""

@@ -21,7 +21,7 @@ from hmc.trace import Floats, Recorder, Traces
 from hmc.worlds import Crew, Flags, Indices, Worlds, finite
 
 ROWS, STEPS = 256, 8  # of states that are priced in one call, at most
-MANY_ROWS = 24576
+MANY_ROWS, MANY_STEPS = 24576, 16  # the same where steps are cheap
 RECORDED = 64  # branches that are all recorded, at most
 
 
@@ -55,6 +55,7 @@ def roll(
     bound: float = math.inf,
     stop: Callable[[], bool] | None = None,
     recorded: tuple[int, ...] | None = None,
+    ahead: tuple[int, ...] | None = None,
 ) -> Rolled | None:
     r"""Roll out schedules (n, T) in step: J = sum_i l_i dt + c_f(x_T, k + T), the risk of it on an ensemble.
 
@@ -74,8 +75,9 @@ def roll(
         stop: asked before every control step; when it says True the rollout ends with None.
         recorded: a schedule that is rolled out beside the others, whatever the bound, and recorded; the
             simulator has worlds for it too.
+        ahead: a schedule before the others, not recorded, with a row of its own in what comes back.
     """
-    tree = tree_of(schedules, trunk[0].modes[: len(trunk[0])], recorded)
+    tree = tree_of(schedules, trunk[0].modes[: len(trunk[0])], recorded or ahead)
     horizon = tree.modes.shape[1]
     rollout = _Rollout(worlds, trunk, tree, bound, recorded is not None)
     first = next((i for i, born in enumerate(tree.born[1:]) if born > 0), horizon)
@@ -83,7 +85,7 @@ def roll(
         if stop is not None and stop():
             return None
         rollout.advance(i)
-    return rollout.rolled(len(tree.row) - len(schedules))
+    return rollout.rolled(0 if recorded is None else 1)
 
 
 class _Rollout:
@@ -125,9 +127,10 @@ class _Rollout:
         self.constant = task.modes.constants is not None
         self.rows = MANY_ROWS if self.cheap or self.later else ROWS
         # what steps cost can wait where nothing is given up for it
-        patient = self.limit == math.inf and not self.later
+        patient = self.limit == math.inf and (self.cheap or not self.later)
         often = self.watchful and not (self.later or self.cheap)
-        self.at_once = 1 if often else self.rows if patient or self.cheap else STEPS
+        most = MANY_STEPS if self.cheap else STEPS
+        self.at_once = 1 if often else self.rows if patient else most
         # what is beyond its limit has no children, where to find out takes less time than to step those
         self.before_births = not (self.cheap or self.later or patient)
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hmc.neighbours import Neighbours
+from hmc.neighbours import Indices, Neighbours
 
 
 @dataclass(frozen=True)
@@ -146,23 +146,35 @@ class SwitchSpace:
         """Inverse of ``space[index]``."""
         if switch.mode >= self.num_modes or switch.stop > self.horizon:
             raise ValueError(f"{switch!r} is not among {self.num_modes} modes x {self.horizon} steps")
-        row, column = switch.start, switch.duration - 1
-        if 2 * row >= self.horizon:
-            row = 2 * self.horizon - self._width - row
-            column += self.horizon - row
-        return switch.mode * self._intervals + row * self._width + column
+        return int(self._index(switch.mode, np.array(switch.start), np.array(switch.duration)))
+
+    def coarse(self, parts: int) -> Tensor:
+        """Indices of the switches that begin and end where a horizon cut into `parts` is cut, ascending."""
+        cuts = np.unique(np.arange(parts + 1) * self.horizon // parts)
+        start, stop = (cuts[ends] for ends in np.triu_indices(len(cuts), 1))
+        modes = np.arange(self.num_modes)[:, None]
+        return torch.from_numpy(np.sort(self._index(modes, start, stop - start).ravel()))
+
+    def _index(self, mode: int | Indices, start: Indices, duration: Indices) -> Indices:
+        """The index of switches."""
+        lower = 2 * start >= self.horizon
+        row = np.where(lower, 2 * self.horizon - self._width - start, start)
+        column = duration - 1 + lower * (self.horizon - row)
+        found: Indices = mode * self._intervals + row * self._width + column
+        return found
 
     def split(self, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mode, start and duration of each index: three long tensors in the shape of `indices`."""
-        mode = indices // self._intervals
-        interval = indices % self._intervals
+        flat = indices.cpu().numpy()  # which divides several times as fast
+        mode = flat // self._intervals
+        interval = flat - mode * self._intervals
         row = interval // self._width
-        column = interval % self._width
+        column = interval - row * self._width
         durations = self.horizon - row
-        upper = column < durations
-        start = torch.where(upper, row, 2 * self.horizon - self._width - row)
-        duration = torch.where(upper, column, column - durations) + 1
-        return mode, start, duration
+        lower = column >= durations
+        start = np.where(lower, 2 * self.horizon - self._width - row, row)
+        duration = column + 1 - lower * durations
+        return torch.as_tensor(mode), torch.as_tensor(start), torch.as_tensor(duration)
 
     def stitch(self, schedule: Schedule, indices: Tensor) -> Tensor:
         """`schedule` with each of the switches `indices` (N,) in turn, (N, T), in a type that fits."""
@@ -170,7 +182,7 @@ class SwitchSpace:
 
     def neighbours(self, schedule: Schedule, indices: Tensor) -> Neighbours:
         """The same, as what differs from `schedule`."""
-        mode, start, duration = (part.numpy() for part in self.split(indices.cpu()))
+        mode, start, duration = (part.numpy() for part in self.split(indices))
         return Neighbours.of(schedule, self.num_modes, mode, start, start + duration)
 
 
@@ -268,11 +280,11 @@ class InOrder:
 
     Args:
         size: of the range.
-        first: what comes first, in a batch of its own.
+        first: what comes first, (n,) long, in a batch of its own.
     """
 
-    def __init__(self, size: int, first: Sequence[int] = ()):
-        self._first = torch.tensor(first, dtype=torch.long)
+    def __init__(self, size: int, first: Tensor | None = None):
+        self._first = torch.empty(0, dtype=torch.long) if first is None else first
         later = torch.ones(size, dtype=torch.bool)
         later[self._first] = False
         self._later = later.nonzero()[:, 0]

@@ -17,7 +17,8 @@ from hmc.neighbours import Neighbours
 from hmc.schedule import Draws, InOrder, Schedule, Switch, SwitchSpace, TailsFirst
 
 Pairs = list[tuple[Switch, ...]]
-SCOUTS = 96  # draws that come before all others are tried, where they find out what can be given up
+PARTS = 8  # of a horizon: switches from cut to cut come first, where that shows what can be given up
+WORTH = 8  # others to each of them, at least: where there are few it takes longer than it saves
 
 
 @dataclass
@@ -194,16 +195,15 @@ def sample(search: Search) -> None:
 def exhaustive(search: Search) -> None:
     """Problem 5 solved exactly: the best of all of Omega; of equal ones, that of lowest index.
 
-    Where a task bounds what is left of a rollout, a few draws come first: most of the others can be given up
-    soon then.
+    Where a task bounds what is left of a rollout, the switches of a coarse grid come first: most of the
+    others can be given up soon then.
     """
     size, task = len(search.space), search.evaluator.task
-    first: list[int] = []
     bounded = task.cost.nonnegative and (task.lower_bound is not None or task.tail_bound is not None)
-    if bounded and min(size, search.samples) >= 8 * SCOUTS:
-        first = sorted(Draws(size, search.rng).take(SCOUTS).tolist())
-    else:
+    first = search.space.coarse(PARTS) if bounded else None
+    if first is None or min(size, search.samples) < WORTH * len(first):
         search.begin()
+        first = None
     lowest = math.inf, size
     for indices, costs, _, _ in search.batches(InOrder(size, first)):
         best = int(costs.argmin())

@@ -117,14 +117,14 @@ def test_what_a_step_adds_to_h_is_allowed_for(cfg, seed, u):
     assert 0.2 * drift < float(added.max()) <= drift
 
 
-@given(cfg=cfgs, seed=seeds, scouts=st.sampled_from([1, 96]))
+@given(cfg=cfgs, seed=seeds, worth=st.sampled_from([0, 8]))
 @settings(max_examples=60)
-def test_the_cartpoles_bound_never_changes_a_plan(cfg, seed, scouts):
+def test_the_cartpoles_bound_never_changes_a_plan(cfg, seed, worth):
     task, x = cartpole(cfg), initial_state(cfg)
     generator = torch.Generator().manual_seed(seed)
     runs = torch.randint(cfg.num_modes, (4,), generator=generator).repeat_interleave(-(-cfg.horizon // 4))
     options = {"schedule": runs[: cfg.horizon].tolist(), "solver": "exhaustive", "iterations": 2}
-    with mock.patch.object(solvers, "SCOUTS", scouts):
+    with mock.patch.object(solvers, "WORTH", worth):
         bounded, free = (plan(each, x, **options) for each in (task, replace(task, tail_bound=None)))
     assert what_matters(bounded) == what_matters(free)
 
@@ -170,15 +170,15 @@ def bounded_task(seed: int, horizon: int, cheap: bool) -> tuple[Task, list[float
 @given(
     system=st.tuples(seeds, st.integers(1, 8), st.booleans()),
     solver=st.sampled_from(["sample", "exhaustive"]),
-    scouts=st.integers(1, 4),
+    parts=st.integers(1, 4),
     samples=st.sampled_from([3, 20, 200]),
 )
 @settings(max_examples=200)
-def test_a_tight_bound_never_changes_a_plan(system, solver, scouts, samples):
+def test_a_tight_bound_never_changes_a_plan(system, solver, parts, samples):
     task, x, incumbent = bounded_task(*system)
     options = {"schedule": incumbent, "solver": solver, "samples": samples, "iterations": 2}
     plain = replace(task, tail_bound=None, cost=replace(task.cost, nonnegative=False))
-    with mock.patch.object(solvers, "SCOUTS", scouts):
+    with mock.patch.multiple(solvers, PARTS=parts, WORTH=1):
         free, bounded = plan(plain, x, **options), plan(task, x, **options)
     assert what_matters(bounded) == what_matters(free)
 
@@ -188,30 +188,41 @@ def test_of_equal_switches_the_first_is_taken_though_another_came_before():
     cost = Cost({"input": lambda x, u, u_prev, k: (u[:, 0] - 1).abs()}, nonnegative=True)
     task = toy_task(12, [Push(0.0, "off"), Push(1.0, "on"), Push(1.0, "also")], cost)
     bounded = replace(task, tail_bound=lambda mode, x, k, steps: None)
-    for seed in range(20):
-        with mock.patch.object(solvers, "SCOUTS", 20):
-            found = plan(bounded, [0.0, 0.0], solver="exhaustive", iterations=1, seed=seed)
+    for parts in range(2, 13):
+        with mock.patch.multiple(solvers, PARTS=parts, WORTH=0):
+            found = plan(bounded, [0.0, 0.0], solver="exhaustive", iterations=1)
         assert found.switches == plan(task, [0.0, 0.0], solver="exhaustive", iterations=1).switches
 
 
-def test_the_incumbent_is_rolled_out_beside_the_scouts():
+@pytest.mark.parametrize("cheap", [False, True])
+def test_the_incumbent_is_rolled_out_beside_others(cheap):
     cfg = CartpoleCfg(horizon=40)
     task, x, idle = cartpole(cfg), initial_state(cfg), Schedule((2,) * 40)
     sim = task.make_sim(500)
-    one, other = (Evaluator(task, sim, make_start(task, sim, x)) for _ in range(2))
-    one.aim(idle)
-    assert one.control_steps == 0
-    rows = SwitchSpace(5, 40).stitch(idle, torch.arange(0, 4000, 40))
-    costs = one.costs(rows)
-    steps = one.control_steps
-    assert one.follow(idle) == other.follow(idle)
-    assert one.control_steps == steps, "it is recorded by then"
-    assert torch.equal(other.costs(rows), costs)
-    assert torch.equal(one.trunk.snapshots, other.trunk.snapshots)
-    assert one.trunk.cost == other.trunk.cost
-    alone = Evaluator(task, task.make_sim(1), make_start(task, sim, x))
-    alone.aim(idle)  # no room beside it
-    assert alone.trunk.cost == one.trunk.cost
+    space, omega = SwitchSpace(5, 40), torch.arange(2 * 820)  # of modes 0 and 1
+    with mock.patch.object(CartpoleSim, "cheap", cheap):
+        one, other = (Evaluator(task, sim, make_start(task, sim, x)) for _ in range(2))
+        one.aim(idle)
+        assert one.control_steps == 0
+        some = space.neighbours(idle, omega[::20])
+        costs = one.costs(some)
+        steps = one.control_steps
+        assert one.follow(idle) == other.follow(idle)
+        assert one.control_steps == steps
+        assert one.pending == (40 if cheap else 0), "cheap steps are made again rather than recorded"
+        assert torch.equal(other.costs(some), costs)
+        # the next ones are worth less than the incumbent: it is given up on the way, and known all the same
+        some, bound = space.neighbours(idle, omega[7::20]), float(costs.min())
+        assert torch.equal(one.costs(some, bound), other.costs(some, bound))
+        assert one.follow(idle) == other.follow(idle) > bound
+        assert one.rollouts == other.rollouts
+        one.record()
+        assert one.pending == 0
+        assert torch.equal(one.trunk.snapshots, other.trunk.snapshots)
+        assert one.trunk.cost == other.trunk.cost
+        alone = Evaluator(task, task.make_sim(1), make_start(task, sim, x))
+        alone.aim(idle)  # no room beside it
+        assert alone.trunk.cost == one.trunk.cost
 
 
 def test_interrupted_before_the_incumbent_is_known():

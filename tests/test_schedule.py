@@ -125,6 +125,14 @@ def test_every_switch_has_an_index(data, space):
     assert space[space.index(switch)] == switch
 
 
+@given(st.builds(SwitchSpace, st.integers(1, 3), st.integers(1, 20)), st.integers(1, 12))
+def test_coarse_switches_begin_and_end_at_cuts(space, parts):
+    cuts = {i * space.horizon // parts for i in range(parts + 1)}
+    switches = [space[i] for i in range(len(space))]
+    expected = [i for i, switch in enumerate(switches) if {switch.start, switch.stop} <= cuts]
+    assert space.coarse(parts).tolist() == expected
+
+
 def test_space_of_more_than_a_billion():
     space = SwitchSpace(3, 100_000)
     assert len(space) == 15_000_150_000
@@ -187,11 +195,11 @@ def test_in_order():
 
 
 def test_in_order_after_some_that_come_first():
-    order, taken = InOrder(6, [1, 4]), []
+    order, taken = InOrder(6, torch.tensor([1, 4])), []
     while order.left > 0:
         taken.append(order.take(3).tolist())
     assert taken == [[1, 4], [0, 2, 3], [5]]
-    assert [InOrder(6, [1, 4]).take(1).tolist(), InOrder(0).take(3).tolist()] == [[1], []]
+    assert [InOrder(6, torch.tensor([1, 4])).take(1).tolist(), InOrder(0).take(3).tolist()] == [[1], []]
 
 
 @given(num_modes=st.integers(1, 4), horizon=st.integers(1, 12), n=st.integers(1, 40), seed=st.integers(0, 99))

@@ -49,7 +49,8 @@ def test_a_million_schedules_have_a_million_rows():
 def test_a_pruned_cost_answers_only_those_who_have_no_use_for_it():
     table = Table(3, 2)
     rows = table.rows(torch.tensor([[0, 1], [1, 1], [2, 1], [0, 1]]))
-    assert rows.tolist() == [0, 1, 2, 0]
+    assert rows[0] == rows[3]
+    assert len(set(rows.tolist())) == 3
     table.learn(
         rows[:2], np.array([5.0, 7.0]), np.array([False, True]), np.array([[2.0, 3.0], [math.nan] * 2])
     )
@@ -57,7 +58,7 @@ def test_a_pruned_cost_answers_only_those_who_have_no_use_for_it():
     np.testing.assert_equal(table.costs(rows, 6.0), [5.0, math.inf, math.nan, 5.0])
     assert table.missing(rows, 7.0).tolist() == [False, True, True, False]
     np.testing.assert_equal(table.costs(rows, math.inf), [5.0, math.nan, math.nan, 5.0])
-    assert table.terms(0).tolist() == [2.0, 3.0]
+    assert table.terms(int(rows[0])).tolist() == [2.0, 3.0]
     table.learn(rows[1:2], np.array([9.0]), np.array([False]), np.array([[4.0, 5.0]]))
     np.testing.assert_equal(table.costs(rows, math.inf), [5.0, 9.0, math.nan, 5.0])
 
