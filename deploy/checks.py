@@ -8,6 +8,7 @@ from collections import Counter
 import numpy as np
 
 from deploy.codec import FrameError, RobotState, decode_state
+from deploy.remote import ABSENT
 from deploy.settings import InputCfg
 from deploy.timing import Silence
 from hmc.go2.network import LOWER, UPPER
@@ -38,6 +39,7 @@ class StateChecks:
         self._silence = Silence(cfg.max_age, cfg.stall, _LOOK)
         self._fault = ""
         self._last = ""
+        self._remote: int | None = None  # ms of the last frame with a remote, or of the first frame
         margin = (UPPER - LOWER) / 2 + cfg.joint_margin
         speed, torque = np.full(12, cfg.joint_speed), np.full(12, cfg.torque)
         widths = (np.full(4, 1.1), np.full(3, cfg.gyro), np.full(3, cfg.acc), margin, speed, torque)
@@ -69,6 +71,8 @@ class StateChecks:
             self.counts["gap"] += ahead // 2 - 1
             self.ms += ahead
         self._silence.hear(now)
+        if state.remote != ABSENT or self._remote is None:
+            self._remote = self.ms
         if (hottest := int(state.temperature.max())) > self.cfg.temperature:
             self._fault = f"a motor has {hottest} deg C, allowed are {self.cfg.temperature:g}: let it cool"
         return state
@@ -78,7 +82,10 @@ class StateChecks:
         if self._fault:
             return self._fault
         if not self._silence.too_long(now):
-            return ""
+            alone = 0.001 * (self.ms - (self.ms if self._remote is None else self._remote))
+            if alone <= self.cfg.remote:
+                return ""
+            return f"no remote for {alone:.1f} s: turn it on and go near, it is what stops the robot"
         age = f"for {1e3 * (now - self.heard):.0f} ms" if math.isfinite(self.heard) else "yet"
         last = f" (the last one refused: {self._last})" if self._last else ""
         return f"no good state frame {age}{last}"

@@ -10,7 +10,9 @@ from enum import IntFlag
 from typing import NamedTuple
 
 SIZE = 40
-_LAYOUT = struct.Struct("<2xH3f4xf16x")  # buttons, lx, rx, ry, (analogue L2,) ly
+ABSENT = bytes(SIZE)  # what a robot tells that has no remote near
+_HEAD = 0x5155  # of ours: some octet of a remote that is near is not zero
+_LAYOUT = struct.Struct("<HH3f4xf16x")  # head, buttons, lx, rx, ry, (analogue L2,) ly
 
 
 class Button(IntFlag):
@@ -46,12 +48,12 @@ class Remote(NamedTuple):
 
 def pack(remote: Remote) -> bytes:
     """The octets that carry the remote, (40)."""
-    return _LAYOUT.pack(remote.buttons, remote.lx, remote.rx, remote.ry, remote.ly)
+    return _LAYOUT.pack(_HEAD, remote.buttons, remote.lx, remote.rx, remote.ry, remote.ly)
 
 
 def unpack(octets: bytes) -> Remote:
-    """The remote in its octets; ValueError if they are not 40. All zeros while no remote is near."""
+    """The remote in its octets; ValueError if they are not 40. One that is not near presses nothing."""
     if len(octets) != SIZE:
         raise ValueError(f"the remote's part of a LowState frame has {SIZE} octets, got {len(octets)}")
-    buttons, lx, rx, ry, ly = _LAYOUT.unpack(octets)
+    _, buttons, lx, rx, ry, ly = _LAYOUT.unpack(octets)
     return Remote(Button(buttons), lx, ly, rx, ry)

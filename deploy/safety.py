@@ -18,6 +18,7 @@ damping  resists motion, for good     -                     -               -
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -50,14 +51,14 @@ class Inputs:
     """What the state machine decides by.
 
     Attributes:
-        buttons: pressed on the remote.
+        buttons: pressed on the remote; None: unknown, as no frame came that is believed.
         fault: what is wrong; "" for nothing.
         posed: whether the phase's slow motion has come to its end.
         settled: whether the estimator knows the state.
         planner: whether the planner has been heard of.
     """
 
-    buttons: Button = NOTHING
+    buttons: Button | None = NOTHING
     fault: str = ""
     posed: bool = False
     settled: bool = False
@@ -84,11 +85,12 @@ class Machine:
 
     def step(self, inputs: Inputs) -> Phase:
         """The phase after these inputs."""
-        pressed = inputs.buttons & ~self._before
-        self._before = inputs.buttons
+        # a button that is held while frames get lost is not pressed anew after them
+        buttons = self._before if inputs.buttons is None else inputs.buttons
+        pressed, self._before = buttons & ~self._before, buttons
         if self.phase == Phase.DAMPING:
             return self.phase
-        if inputs.buttons & EMERGENCY == EMERGENCY:
+        if inputs.buttons is not None and buttons & EMERGENCY == EMERGENCY:
             return self.damp("the operator pressed L2 and B")
         if inputs.fault and self.phase != Phase.PASSIVE:
             return self.damp(inputs.fault)
@@ -163,6 +165,10 @@ def violations(cfg: EnvelopeCfg, body: Body, since: float) -> list[str]:
         if not value <= high:
             found.append(f"{what} is {value:.3g} {unit}, at most {high:g} allowed")
 
+    low, high = np.tile(cfg.joint_low, 4), np.tile(cfg.joint_high, 4)
+    if not (beyond := np.maximum(low - body.q, body.q - high)).max() <= 0.0:
+        i = int(np.argmax(np.where(np.isnan(beyond), math.inf, beyond)))
+        found.append(f"{facts.JOINTS[i]} is {body.q[i]:.3g} rad, {low[i]:g} to {high[i]:g} allowed")
     most("lean", abs(float(np.degrees(lean(body.up)))), cfg.lean, "deg")
     most("joint speed", float(np.abs(body.dq).max()), cfg.joint_speed, "rad/s")
     most("joint torque", float((np.abs(body.tau) / PEAK_TORQUE).max()), cfg.torque, "of the motor's peak")

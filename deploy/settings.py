@@ -20,6 +20,7 @@ class InputCfg:
         torque: largest reading [N m].
         temperature: of a motor, at most [deg C].
         min_charge: of the battery, to start with [%].
+        remote: time without the remote after which the robot is damped [s]: its L2 and B end everything.
     """
 
     max_age: float = 0.06
@@ -31,6 +32,7 @@ class InputCfg:
     torque: float = 90.0
     temperature: float = 85.0
     min_charge: int = 20
+    remote: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class EnvelopeCfg:
         lean: of its plane of symmetry from the vertical, at most [deg].
         height: of the base, least and most [m].
         settle: time without limits of pitch and height after the mode's entry [s].
+        joint_low, joint_high: of hip, thigh and calf of every leg [rad]; by default more than they can.
         joint_speed: at most [rad/s].
         torque: of a joint, relative to its motor's peak, at most.
         velocity_std: of the estimated velocity, at most [m/s].
@@ -55,6 +58,8 @@ class EnvelopeCfg:
     lean: float = 60.0
     height: tuple[float, float] = (-0.1, 2.0)
     settle: float = 0.0
+    joint_low: tuple[float, float, float] = (-1.15, -1.67, -2.83)
+    joint_high: tuple[float, float, float] = (1.15, 4.64, -0.73)
     joint_speed: float = 45.0
     torque: float = 1.5
     velocity_std: float = 1.0
@@ -83,12 +88,14 @@ class RampCfg:
         seconds: duration [s].
         kp: [N m/rad].
         kd: [N m s/rad].
+        step: change of a joint's target from one control step to the next, at most [rad].
     """
 
     pose: tuple[float, float, float]
     seconds: float
     kp: float
     kd: float
+    step: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -96,11 +103,11 @@ class OutputCfg:
     """Limits of what is commanded.
 
     Attributes:
-        step: change of a joint's target from one control step to the next, at most [rad].
+        step: change of a joint's target from one control step to the next while modes run, at most [rad].
         damping: gain while the robot is damped [N m s/rad].
     """
 
-    step: float = 2.5
+    step: float = 2.0
     damping: float = 5.0
 
 
@@ -130,13 +137,15 @@ class WatchdogCfg:
         hang: age of the control process's heartbeat at which it counts as hung, without the time in which the
             watchdog stood still itself [s].
         stall: age at which it does in any case [s].
-        lost: age of the watchdog's own at which the control process damps [s].
+        lost: age of the watchdog's own at which the control process damps [s], counted as `hang` is.
+        after: how long it goes on damping when the program that started it is gone [s].
     """
 
     period: float = 0.004
     hang: float = 0.07
     stall: float = 0.2
-    lost: float = 0.5
+    lost: float = 0.08
+    after: float = 5.0
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from deploy.checks import StateChecks
 from deploy.codec import encode_state, seal
-from deploy.remote import Button
+from deploy.remote import ABSENT, Button
 from deploy.safety import EMERGENCY, Body, Envelope, Inputs, Machine, Phase, limited, violations
 from deploy.settings import DeployCfg, EnvelopeCfg, InputCfg
 from hmc.cfg import load
@@ -90,6 +90,24 @@ def test_a_button_held_down_is_one_press_and_none_at_the_start():
     assert [it.step(held) for _ in range(3)] == [Phase.LIE] * 3
 
 
+def test_what_is_held_while_nothing_is_known_is_not_pressed_again():
+    it = Machine()
+    held, unknown, known = Inputs(Button.START, posed=True), Inputs(None), {"posed": True, "planner": True}
+    assert [it.step(i) for i in (unknown, held, unknown, held)] == [
+        Phase.PASSIVE
+    ] * 4  # since before it began
+    it.step(Inputs())
+    assert [it.step(i) for i in (held, unknown, held)] == [Phase.LIE] * 3
+    it = machine(Phase.READY)
+    for buttons in (Button.START, None, Button.START, None, Button.START):
+        it.step(Inputs(buttons, **known))
+    assert it.phase == Phase.HYBRID
+    assert not it.asked
+    it = machine(Phase.HYBRID)  # nor is an emergency made up of what was pressed before
+    it.step(Inputs(Button.L2))
+    assert it.step(Inputs(None)) == Phase.HYBRID
+
+
 @pytest.mark.parametrize(
     ("phase", "hint"),
     [(Phase.LIE, "does not lie"), (Phase.STAND, "not ready"), (Phase.READY, "planner has not started")],
@@ -133,6 +151,8 @@ def test_each_stance_is_within_its_own_envelope_and_no_other():
     ("body", "told"),
     [
         (replace(UPRIGHT, up=np.array([0.0, 1.0, 0.0])), "lean is 90 deg"),
+        (replace(UPRIGHT, q=np.array(facts.HOME) + 2.0 * (np.arange(12) == 5)), "FR_calf is 0.2 rad, -2.83"),
+        (replace(UPRIGHT, q=np.where(np.arange(12) == 7, np.nan, facts.HOME)), "RL_thigh is nan rad"),
         (replace(UPRIGHT, dq=np.full(12, -50.0)), "joint speed is 50 rad/s"),
         (replace(UPRIGHT, tau=np.full(12, 60.0)), "joint torque is 2.97"),
         (replace(UPRIGHT, velocity_std=3.0), "velocity uncertainty is 3 m/s"),
@@ -156,6 +176,22 @@ def test_an_envelope_has_patience_and_forgets():
     assert envelope.check(cfg, "ready", UPRIGHT, 1.0, 5.021) == ""
     assert envelope.check(cfg, "ready", tilted, 1.0, 5.04) == ""
     assert envelope.check(cfg, "ready", tilted, 1.0, 5.08) == "in ready: lean is 30 deg, at most 10 allowed"
+
+
+def test_each_mode_has_joint_ranges_of_its_own():
+    """A leg that is where this mode never has it is outside, though the motors can go there."""
+    cfg = load(Path("cfg/deploy.toml"), DeployCfg)
+    for name, body in (("ready", UPRIGHT), ("foot", NOSE_UP), ("hand", NOSE_DOWN)):
+        envelope = getattr(cfg.envelope, name)
+        assert violations(envelope, body, 10.0) == []
+        for joint in range(12):
+            low, high = envelope.joint_low[joint % 3], envelope.joint_high[joint % 3]
+            for angle, wrong in ((low, False), (low - 0.01, True), (high, False), (high + 0.01, True)):
+                q = np.array(facts.HOME)
+                q[joint] = angle
+                found = violations(envelope, replace(body, q=q), 10.0)
+                assert [text.split()[0] for text in found] == [facts.JOINTS[joint]] * wrong
+    assert violations(cfg.envelope.ready, replace(UPRIGHT, q=np.array(facts.HOME) + [0.6, 0, 0] * 4), 10.0)
 
 
 @given(st.lists(st.floats(-1e9, 1e9), min_size=12, max_size=12), st.integers(0, 99))
@@ -239,6 +275,21 @@ def test_the_robots_clock_overflows_and_restarts():
     long.take(good(500_000), 1.0)
     assert long.take(good(2), 1.0) is None
     assert "it restarted" in long.fault(1.0)
+
+
+def test_a_remote_that_is_gone_is_a_fault_until_it_is_back():
+    """By the robot's clock; a robot that has never had one near gets as long."""
+    far = {"remote": ABSENT}
+    for first in ({}, far):
+        checks = StateChecks(InputCfg(remote=3.0))
+        assert checks.take(changed(100, **first), 1.0) is not None
+        for tick in range(200, 3101, 100):
+            assert checks.take(changed(tick, **far), 1.0) is not None
+            assert checks.fault(1.0) == ""
+        assert checks.take(changed(3102, **far), 1.0) is not None
+        assert checks.fault(1.0).startswith("no remote for 3.0 s")
+        assert checks.take(good(3104), 1.0) is not None
+        assert checks.fault(1.0) == ""
 
 
 def test_a_hot_motor_is_a_fault():

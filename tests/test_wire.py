@@ -22,7 +22,7 @@ from deploy import codec
 from deploy.codec import FrameError, decode_command, decode_state, encode_command, encode_state
 from deploy.crc import crc32
 from deploy.messages import LowCmd_, LowState_, Request_, Response_
-from deploy.remote import Button, Remote, pack, unpack
+from deploy.remote import ABSENT, Button, Remote, pack, unpack
 from tests import wire
 
 ROOT = Path(__file__).parent.parent
@@ -186,7 +186,9 @@ def test_remote_by_hand() -> None:
         struct.pack_into("<f", octets, at, value)
     remote = Remote(Button.L2 | Button.B, lx=0.25, ly=-0.75, rx=-0.5, ry=1.0)
     assert unpack(bytes(octets)) == remote
-    assert pack(remote) == bytes(octets)
+    assert pack(remote)[2:] == bytes(octets)[2:]
+    assert any(pack(Remote())), "one that is near and untouched is not none"
+    assert unpack(ABSENT) == Remote()
     assert unpack(bytes(40)) == Remote()
 
 
