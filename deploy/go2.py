@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -33,7 +34,8 @@ from hmc.cli import command_line, one_line_errors  # noqa: E402
 
 LOOK = 0.05  # s
 START_UP = 60.0  # s for a process to be ready
-DAMPED = 0.5  # s of the watchdog's damping after the control process
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # what ends a run: a lost terminal, too
+DAMPED = 3.0  # s of the watchdog's damping after the control process: a robot on two legs falls meanwhile
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Args:
         hold: of the foot stand before the handstand is asked for, on the stand-in [s].
         keys: the keyboard has the remote's buttons, and pushes; on the stand-in only.
         speed: of the stand-in's clock, for slow motion where the machine is busy; 1 on a robot.
+        real_time: ask the kernel for real-time priority.
     """
 
     interface: str = LOOPBACK
@@ -78,6 +81,7 @@ class Args:
     hold: float = HOLD
     keys: bool = False
     speed: float = 1.0
+    real_time: bool = True
 
     @property
     def simulated(self) -> bool:
@@ -102,6 +106,7 @@ class Args:
             seed=self.seed,
             threads=self.threads,
             speed=self.speed,
+            real_time=self.real_time,
         )
 
 
@@ -118,7 +123,7 @@ def stand_in(args: Args, domain: int) -> Iterator[Port]:
     """The stand-in as a process, lying; its truth goes to truth.npz when it ends."""
     command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--robot.start", "lying"]
     command += ["--robot.seed", str(args.seed), "--log", str(args.out / "truth.npz")]
-    command += ["--speed", str(args.speed), *args.robot.split()]
+    command += ["--speed", str(args.speed), "--parent", str(os.getpid()), *args.robot.split()]
     # a session of its own: Ctrl-C is ours to pass on, when the robot has been damped
     process = subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -158,8 +163,20 @@ def _end_all(processes: list[subprocess.Popen[str]]) -> None:
         _end(process)
 
 
+def _stay_damped(board: Board) -> None:
+    """Give the watchdog its time, if anything was commanded; no Ctrl-C cuts it short."""
+    heart = board.heart.read()
+    if heart is not None and heart["commanding"]:
+        before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING}
+        time.sleep(DAMPED)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def run(args: Args, console: Console, port: Port | None) -> Memory:
     """Start all processes, show the run until it is over, end them so that the robot stays damped.
+
+    On a robot that is damped, or whose control process has ended, it is over when the operator says so.
 
     Returns:
         What memory they took.
@@ -174,24 +191,32 @@ def run(args: Args, console: Console, port: Port | None) -> Memory:
         os.close(source)
         watch: list[subprocess.Popen[str]] = []
         stack.callback(_end_all, watch)
+        stack.callback(_stay_damped, board)
+        planners: list[subprocess.Popen[str]] = []
+        stack.callback(_end_all, planners)
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE}
         control = spawn("loop", Job(**{**base, "log": sink}), [board.descriptor, sink], **pipes)
         os.close(sink)
-        stack.callback(time.sleep, DAMPED)
-        stack.callback(_end, control)
+        stack.callback(_end, control)  # before all others, whose end takes its time
         console.print(f"control process: {_ready(control, 'the control process').strip()}", highlight=False)
         if not args.dry_run:
             watch.append(spawn("watchdog", Job(**{**base, "pid": control.pid}), [board.descriptor]))
         planner = spawn("planner", Job(**base), [board.descriptor])
-        stack.callback(_end, planner)
+        planners.append(planner)
         operator: Presser | None = None
         if port is not None:
             operator = Keyboard(port) if args.keys else Operator(port, args.hold)
             stack.callback(operator.close)
         if args.keys:
             console.print(HELP, highlight=False)
-        memory = Memory({"control": control.pid, "planner": planner.pid, "log": log.pid})
+        pids = {"control": control.pid, "planner": planner.pid, "log": log.pid}
+        if watch:
+            pids["watchdog"] = watch[0].pid
+        memory = Memory(pids)
         follow(board, control, operator, stack.enter_context(View(console)), memory)
+        if operator is None and not args.dry_run:
+            console.print("the control process has ended, the watchdog damps the robot: Ctrl-C ends it")
+            signal.pause()
         return memory
 
 
@@ -229,6 +254,8 @@ def main(args: Args) -> int:
             (args.out / name).unlink(missing_ok=True)
     truth = args.out / "truth.npz" if args.simulated else None
     memory, stolen = Memory({}), Stolen()
+    for number in ENDING:
+        signal.signal(number, signal.default_int_handler)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             if args.simulated:
@@ -238,7 +265,7 @@ def main(args: Args) -> int:
                 memory = run(args, console, None)
     except Ended as ended:
         # what was wrong, the process has said itself
-        return 2 if ended.status in (1, 2) else 1
+        return 2 if ended.status == 2 else 1
     from deploy.summary import summarise, write  # loads torch: seconds that the start need not wait for
 
     with one_line_errors():

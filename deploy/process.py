@@ -44,6 +44,7 @@ class Job:
         seed: of the planner.
         threads: of the planner's engine; 0 for all cores.
         speed: of the robot's clock; not 1 in slow motion alone.
+        real_time: ask the kernel for real-time priority.
     """
 
     board: int = -1
@@ -64,6 +65,7 @@ class Job:
     seed: int = 0
     threads: int = 0
     speed: float = 1.0
+    real_time: bool = True
 
 
 def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:
@@ -82,13 +84,14 @@ def told() -> Job:
 
 
 def until_told(parent_matters: bool = True) -> Callable[[], bool]:
-    """Whether SIGTERM has come; the terminal's Ctrl-C is the parent's business.
+    """Whether SIGTERM has come; the terminal's Ctrl-C and its loss are the parent's business.
 
     Args:
         parent_matters: whether the parent's death counts as SIGTERM: no process outlives the program.
     """
     came: list[int] = []
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
     if parent_matters:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
@@ -97,18 +100,23 @@ def until_told(parent_matters: bool = True) -> Callable[[], bool]:
     return lambda: bool(came)
 
 
-def real_time(priority: int) -> bool:
+def real_time(priority: int, ask: bool = True) -> bool:
     """Ask the kernel for a real-time priority, before other threads start; whether it was granted.
 
     What is loaded by now is not looked at by the garbage collector any more, and what is in memory stays
     there, if the kernel lets it: to read a page of a library from the disk again takes tens of milliseconds.
+
+    Args:
+        priority: from 1 to 99.
+        ask: False for the priority that the process has.
     """
     gc.collect()
     gc.freeze()
     ctypes.CDLL(None).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
     with suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        return True
+        if ask:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        return ask
     return False
 
 

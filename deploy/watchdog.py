@@ -1,7 +1,12 @@
-"""The watchdog's process: damps the robot when the control process dies or hangs, and does not stop."""
+"""The watchdog's process: damps the robot when the control process dies or hangs, and does not stop.
+
+When the program that started it is killed, it stays for a while: the control process is told to end then,
+too, and a robot that falls has to be damped until it lies.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import time
@@ -73,8 +78,14 @@ def watch(
     frame: bytes,
     period: float,
     stopped: Callable[[], bool],
+    after: float,
 ) -> None:
-    """Watch the process of this number until `stopped()`; publish the frame from the latch on."""
+    """Watch the process of this number; publish the frame from the latch on.
+
+    It ends when `stopped()`, and `after` seconds after it has lost its parent, or has latched since.
+    """
+    parent = os.getppid()
+    orphaned = time.monotonic() if parent == 1 else math.inf
     descriptor = os.pidfd_open(pid)
     poll = select.poll()
     poll.register(descriptor, select.POLLIN)
@@ -84,19 +95,25 @@ def watch(
             time.sleep(period)
         else:
             gone = bool(poll.poll(1e3 * period))
-        if watchdog.look(gone, time.monotonic()):
+        now, latched = time.monotonic(), bool(watchdog.reason)
+        if watchdog.look(gone, now):
             publisher.write(frame)
+        if os.getppid() != parent and (orphaned == math.inf or bool(watchdog.reason) != latched):
+            orphaned = now
+        if now - orphaned > after:
+            break
     os.close(descriptor)
 
 
 def main(job: Job) -> None:
     """Be the watchdog until SIGTERM."""
-    stopped = until_told()
+    stopped = until_told(parent_matters=False)
     cfg = load(job.cfg, DeployCfg, job.set)
-    real_time(PRIORITY)
+    real_time(PRIORITY, job.real_time)
     publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
     watchdog = Watchdog(Board(job.board), cfg.watchdog)
-    watch(watchdog, job.pid, publisher, damping(cfg.output.damping), cfg.watchdog.period, stopped)
+    period, after = cfg.watchdog.period, cfg.watchdog.after
+    watch(watchdog, job.pid, publisher, damping(cfg.output.damping), period, stopped, after)
 
 
 if __name__ == "__main__":

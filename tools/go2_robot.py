@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -15,12 +17,20 @@ from tools.robot.process import Args, run
 
 
 def main(args: Args) -> int:
-    """Be the robot until its time is over, or SIGINT or SIGTERM."""
+    """Be the robot until its time is over, or SIGINT or SIGTERM, or it has lost its parent."""
     told: list[int] = []
+
+    def stopped() -> bool:
+        return bool(told) or args.parent not in (0, os.getppid())
+
+    def say(text: str) -> None:
+        with suppress(BrokenPipeError):  # nobody listens any more
+            print(text, flush=True)
+
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda number, _: told.append(number))
     try:
-        run(args, stopped=lambda: bool(told), say=lambda text: print(text, flush=True))
+        run(args, stopped, say)
     except (LinkError, ValueError, RuntimeError) as error:
         print(f"go2_robot: {error}", file=sys.stderr)
         return 1

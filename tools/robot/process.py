@@ -38,6 +38,7 @@ class Args:
         seconds: of simulated time, then it ends.
         speed: of its clock: 0.5 takes 2 s for one of its own, where the machine is too slow for more.
         lockstep: wait for a command after every state instead of keeping time: for tests that repeat.
+        parent: number of the process that started it and without which it ends; 0 for none.
     """
 
     robot: Settings = field(default_factory=Settings)
@@ -49,6 +50,7 @@ class Args:
     seconds: float = float("inf")
     speed: float = 1.0
     lockstep: bool = False
+    parent: int = 0
 
 
 TRUTH = np.dtype(
