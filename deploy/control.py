@@ -15,7 +15,7 @@ from deploy.estimator import Estimator
 from deploy.modes import NAMES, NONE, Performer
 from deploy.observe import vertical
 from deploy.remote import unpack
-from deploy.safety import Body, Envelope, Inputs, Machine, Phase, limited
+from deploy.safety import EMERGENCY, Body, Envelope, Inputs, Machine, Phase, limited
 from deploy.settings import DeployCfg, EnvelopeCfg, RampCfg
 from deploy.slots import STATE
 from deploy.so3 import Array
@@ -72,6 +72,7 @@ class Control:
         self._frame: bytes | None = None
         self._fault = ""
         self._heard: float | None = None  # when the state came that `settle` has yet to look at [s]
+        self._ticked = -1  # ms of the last tick's state
         self._anew = False  # whether the estimator has begun anew since the robot stands
 
     @property
@@ -88,7 +89,8 @@ class Control:
     def react(self, frame: bytes, now: float) -> bool:
         """Take a state frame that came `now` [s], and command what a tick asks for; whether it made one.
 
-        What takes longer, and a command can do without, is left to `settle`, which has to follow.
+        What takes longer, and a command can do without, is left to `settle`, which has to follow. What is
+        known to be wrong without it ends in damping first.
         """
         state = self.checks.take(frame, now)
         if state is None:
@@ -97,6 +99,8 @@ class Control:
         self.state, ms, self._heard = state, self.checks.ms, now
         if self._first < 0:
             self._first = ms
+        if self._fault or self.checks.fault(now) or unpack(state.remote).buttons & EMERGENCY == EMERGENCY:
+            self.settle()
         if (due := (ms - self._first) // TICK) <= self.k:
             return False
         x = None
@@ -106,7 +110,7 @@ class Control:
                 self.settle()
                 x = None if self.estimate is None else self.estimate.x
         self.missed += due - self.k - 1
-        self.k = due
+        self.k, self._ticked = due, ms
         self._tick(x)
         return True
 
@@ -124,7 +128,7 @@ class Control:
             state.tau,
             state.foot_force.astype(np.float64),
         )
-        if self.estimate is not None:
+        if self.estimate is not None and self.checks.ms == self._ticked:
             self.situation["x"] = self.estimate.x
         fault = self._fault or self.checks.fault(now) or self._outside(state)
         if self.phase == Phase.PASSIVE:
@@ -133,12 +137,12 @@ class Control:
 
     def idle(self, now: float) -> None:
         """No frame came that is believed."""
-        self._step(Inputs(fault=self._fault or self.checks.fault(now)))
+        self._step(Inputs(None, self._fault or self.checks.fault(now)))
 
     def fail(self, fault: str) -> None:
         """Something outside is wrong."""
         self._fault = self._fault or fault
-        self._step(Inputs(fault=self._fault))
+        self._step(Inputs(None, self._fault))
 
     @property
     def due_ms(self) -> int:
@@ -176,11 +180,12 @@ class Control:
         try:
             if phase == Phase.HYBRID:
                 assert x is not None
-                wanted, kp, kd = self._perform(x), facts.KP, facts.KD
+                wanted, kp, kd, step = self._perform(x), facts.KP, facts.KD, self.cfg.output.step
             else:
-                assert self._ramp is not None
-                wanted, kp, kd = self._ramped(), self._ramp.kp, self._ramp.kd
-            self.target = limited(wanted, self.target, self.cfg.output.step)
+                ramp = self._ramp
+                assert ramp is not None
+                wanted, kp, kd, step = self._ramped(), ramp.kp, ramp.kd, ramp.step
+            self.target = limited(wanted, self.target, step)
         except ValueError as error:
             self.fail(str(error))
             return
@@ -190,7 +195,7 @@ class Control:
         """What the plan's mode wants in state x; what a planner has to know is taken down before."""
         performer, now = self.performer, self.situation
         performer.take_over(self.k)
-        now["k"], now["u"], now["asked"], now["running"] = self.k, self.target, self.asked, 1
+        now["k"], now["x"], now["u"], now["asked"], now["running"] = self.k, x, self.target, self.asked, 1
         now["mode"], now["entered"], now["anchor"] = performer.mode, performer.entered, performer.anchor
         now["plan"] = performer.plan.number if performer.plan else 0
         return performer.act(self.k, x, self.target)

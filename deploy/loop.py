@@ -25,9 +25,9 @@ from deploy.motion_switcher import MotionSwitcher, MotionSwitcherError
 from deploy.observe import pitch
 from deploy.process import ROOT, Job, real_time, told, until_told
 from deploy.safety import Phase
-from deploy.settings import DeployCfg, InputCfg
+from deploy.settings import DeployCfg
 from deploy.slots import Board, said, text
-from deploy.timing import Lateness
+from deploy.timing import Lateness, Silence
 from hmc.cfg import load
 from hmc.go2 import facts
 from hmc.go2.network import Network
@@ -37,15 +37,19 @@ WAIT = 0.005  # s for a frame
 HEARD = 3.0  # s for the first one
 COMPANY = 0.4  # s for other controllers to be found
 LAST = 0.3  # s of damping before a program that is told to end does
+ROUND = 0.05  # s between two looks for other controllers
+LATE = 0.02  # s after the frames came: who commands only then looks at the watchdog once more
+FOLDED = 0.6  # rad off the pose in which the robot lies, at most, where its own controller may be stopped
 _PRESENCE = 1.0  # s without a word of a planner that waits
+_SILENT = 3.0  # s without a plan, while modes run
 
 
 class Refusal(RuntimeError):
     """The robot is not in a state to be started; says what to do."""
 
 
-def preflight(link: Link, states: Subscriber, cfg: InputCfg, release: bool) -> None:
-    """See that the robot is there, alone, free and charged.
+def preflight(link: Link, states: Subscriber, cfg: DeployCfg, release: bool, dry_run: bool = False) -> None:
+    """See that the robot is there, alone, free and charged; in a dry run only that it is there.
 
     Raises:
         Refusal: it is not.
@@ -59,14 +63,25 @@ def preflight(link: Link, states: Subscriber, cfg: InputCfg, release: bool) -> N
             "the DDS domain right (0 on the robot's network, 1 on lo for the stand-in)?"
         )
         raise Refusal(f"no state frame within {HEARD:g} s; {why}")
+    if dry_run:
+        return
+    told = [state for frame in frames if (state := decode_state(frame)).crc_ok]
+    if not told:
+        raise Refusal("no state frame has a right checksum: is this a Go2?")
     time.sleep(COMPANY)
     if others := link.rivals("rt/lowcmd"):
         raise Refusal(f"another program commands the motors: {', '.join(others)}: end it first")
-    if (charge := decode_state(frames[-1]).charge) < cfg.min_charge:
-        raise Refusal(f"the battery has {charge} %, at least {cfg.min_charge} % is needed: charge it")
+    if (charge := told[-1].charge) < cfg.input.min_charge:
+        raise Refusal(f"the battery has {charge} %, at least {cfg.input.min_charge} % is needed: charge it")
     try:
         switcher = MotionSwitcher(link)
         if (name := switcher.active()) and release:
+            off = np.abs(told[-1].q - np.tile(cfg.lie.pose, 4))
+            if not off.max() <= FOLDED:
+                raise Refusal(
+                    f"the robot does not lie: {facts.JOINTS[int(off.argmax())]} is {off.max():.1f} rad off "
+                    "its folded place, and without its own controller the legs give way: lay it down first"
+                )
             switcher.release()
         elif name:
             raise Refusal(f"the robot's own controller {name!r} runs: lay the robot down, then use --release")
@@ -97,6 +112,7 @@ class Loop:
         dry_run: bool,
         speed: float = 1.0,
     ):
+        cfg = control.cfg.watchdog
         self._link, self._states, self._board = link, states, board
         self._control, self._recorder, self._dry_run = control, recorder, dry_run
         self._speed = speed
@@ -104,9 +120,13 @@ class Loop:
         self._lateness = Lateness()
         self._phase, self._hint, self._logged = Phase.PASSIVE, "", b""
         self._plans = 0  # number of the slot's value read last
+        self._planned = 0.0  # when it was [s]
+        self._quiet = ""  # that there are no plans any more
         self._company = 0.0  # when other controllers were looked for [s]
         self._began = time.monotonic()
         self._silent = False
+        self._guard = Silence(cfg.lost, cfg.stall, WAIT)  # of the watchdog
+        self._commanding = False  # as far as the watchdog was told
 
     def turn(self) -> None:
         """Wait for state frames, command, tell the others."""
@@ -120,16 +140,13 @@ class Loop:
             ticked = control.react(frame, now) or ticked
         if not frames:
             control.idle(now)
-        sent = self._send()
+        sent = self._send(now)
         left = time.monotonic()
         control.settle()
         command = control.command
         if command != sent:  # it damps
-            self._send()
-        heart = board.heart.blank()
-        heart["t"], heart["commanding"] = left, command is not None and not self._dry_run
-        heart["latched"], heart["reason"] = control.phase == Phase.DAMPING, text(control.machine.reason)
-        board.heart.write(heart)
+            self._send(now)
+        self._beat(left)
         for frame in frames:
             self._recorder.add(STATE, frame)
         if command is not None and command != self._logged:
@@ -139,8 +156,9 @@ class Loop:
         if ticked:
             self._tell(now, left)
         elif board.plan.count != self._plans:
+            self._planned = now
             self._take()
-        elif now - self._company > 1.0:  # takes as long as a tick does
+        elif now - self._company > ROUND:
             self._company = now
             self._look_around()
         if control.phase != self._phase or control.machine.hint != self._hint:
@@ -148,12 +166,25 @@ class Loop:
             why = control.machine.reason or self._hint
             self._recorder.event("phase", phase=self._phase.name.lower(), k=control.k, reason=why)
 
-    def _send(self) -> bytes | None:
-        """Send the command, if there is one; it."""
+    def _send(self, now: float) -> bytes | None:
+        """Send the command, if there is one, for what came `now`; it."""
+        late = time.monotonic() - now > LATE
+        if late:  # this process stood still, and the watchdog may have taken over
+            self._listen(time.monotonic())
         command = self._control.command
         if command is not None and self._commands is not None and not self._silent:
+            if not self._commanding:  # the watchdog has to know before the robot does
+                self._beat(now)
             self._commands.write(command)
         return command
+
+    def _beat(self, t: float) -> None:
+        """Tell the watchdog that this process lives."""
+        control, heart = self._control, self._board.heart.blank()
+        self._commanding = control.command is not None and not self._dry_run
+        heart["t"], heart["commanding"] = t, self._commanding
+        heart["latched"], heart["reason"] = control.phase == Phase.DAMPING, text(control.machine.reason)
+        self._board.heart.write(heart)
 
     def _listen(self, now: float) -> None:
         """Read what the watchdog has to say, and whether a planner is there."""
@@ -164,7 +195,9 @@ class Loop:
             control.fail(said(guard["reason"].item()))
         if not self._dry_run:
             control.wait = "the watchdog has not started yet" if guard is None else ""
-            if guard is not None and now - float(guard["t"]) > control.cfg.watchdog.lost:
+            if guard is not None and float(guard["t"]) != self._guard.heard:
+                self._guard.hear(float(guard["t"]))
+            if guard is not None and self._guard.too_long(now):
                 control.fail("the watchdog does not live any more")
         told = board.plan.read() if control.phase == Phase.READY else None
         control.planner = told is not None and now - float(told["t"]) < _PRESENCE
@@ -203,6 +236,10 @@ class Loop:
         """Tell planner, view and log of a tick."""
         control, performer = self._control, self._control.performer
         late = self._lateness.add(0.001 * control.due_ms / self._speed, left)
+        quiet = control.phase == Phase.HYBRID and now - self._planned > _SILENT / self._speed
+        if quiet != bool(self._quiet):
+            self._quiet = "the planner is silent: the stance goes on; SELECT damps" if quiet else ""
+            self._recorder.event("planner", silent=quiet, k=control.k)
         if control.phase == Phase.HYBRID:
             control.situation["t"] = now
             self._board.state.write(control.situation)
@@ -224,7 +261,7 @@ class Loop:
         status["plans"] = performer.counts["taken"]
         status["late_plans"] = performer.counts["late"] + performer.counts["stale"]
         status["charge"] = control.state.charge if control.state else 0
-        status["reason"] = text(control.machine.reason or control.machine.hint)
+        status["reason"] = text(control.machine.reason or self._quiet or control.machine.hint)
         if estimate is not None:
             status["pitch"], status["height"] = np.degrees(pitch(estimate.C[2])), estimate.x[2]
         self._board.status.write(status)
@@ -242,7 +279,7 @@ class Loop:
         self._recorder.add(TICK_RECORD, tick.tobytes())
 
     def end(self) -> None:
-        """Damp the robot for a moment and say how it went; the watchdog goes on damping."""
+        """Damp the robot for a moment and say how it went; then the watchdog damps it."""
         control = self._control
         control.fail("the program was told to end")
         until = time.monotonic() + (LAST if control.command is not None else 0.0)
@@ -274,10 +311,10 @@ def run(job: Job, stopped: Callable[[], bool]) -> None:
     slow = replace(cfg.input, max_age=cfg.input.max_age / job.speed, stall=cfg.input.stall / job.speed)
     cfg = replace(cfg, input=slow)
     control = Control(cfg, policies(job.foot, job.hand))
-    quick = real_time(PRIORITY)
+    quick = real_time(PRIORITY, job.real_time)
     link = Link(job.domain, job.interface)
     states = link.subscriber("rt/lowstate", LowState_)
-    preflight(link, states, cfg.input, job.release)
+    preflight(link, states, cfg, job.release, job.dry_run)
     loop = Loop(link, states, Board(job.board), control, Recorder(job.log), job.dry_run, job.speed)
     print(f"ready: {'real-time' if quick else 'normal'} priority", flush=True)
     states.take()  # those that came meanwhile are old

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
@@ -18,11 +19,13 @@ from deploy.dds import Link
 from deploy.loop import Refusal, preflight
 from deploy.messages import LowCmd_, LowState_
 from deploy.motion_switcher import MotionSwitcherService
-from deploy.settings import InputCfg
+from deploy.settings import DeployCfg, InputCfg
+from hmc.go2 import facts
 from tests import wire
 
 DOMAIN = 125 + os.getpid() % 100
-CFG = InputCfg(min_charge=20)
+CFG = DeployCfg(input=InputCfg(min_charge=20))
+LYING = np.tile(CFG.lie.pose, 4) + 0.3
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +34,9 @@ def _soon(monkeypatch) -> None:
 
 
 @contextmanager
-def robot(charge: int = 80, controller: str = "") -> Iterator[MotionSwitcherService]:
+def robot(
+    charge: int = 80, controller: str = "", q: np.ndarray = LYING, broken: bool = False
+) -> Iterator[MotionSwitcherService]:
     """States at 500 Hz and a motion switcher."""
     link, stop = Link(DOMAIN), threading.Event()
     states, service = link.publisher("rt/lowstate", LowState_), MotionSwitcherService(link, controller)
@@ -40,7 +45,9 @@ def robot(charge: int = 80, controller: str = "") -> Iterator[MotionSwitcherServ
         tick = 0
         while not stop.is_set():
             tick += 2
-            states.write(encode_state(wire.state()._replace(tick=tick, charge=charge)))
+            frame = bytearray(encode_state(wire.state()._replace(tick=tick, charge=charge, q=q)))
+            frame[500] ^= broken
+            states.write(bytes(frame))
             service.serve()
             time.sleep(0.002)
 
@@ -53,9 +60,9 @@ def robot(charge: int = 80, controller: str = "") -> Iterator[MotionSwitcherServ
         thread.join()
 
 
-def start(release: bool = False) -> None:
+def start(release: bool = False, dry_run: bool = False) -> None:
     link = Link(DOMAIN)
-    preflight(link, link.subscriber("rt/lowstate", LowState_), CFG, release)
+    preflight(link, link.subscriber("rt/lowstate", LowState_), CFG, release, dry_run)
 
 
 def test_no_robot() -> None:
@@ -84,4 +91,27 @@ def test_the_robots_own_controller() -> None:
         assert service.name == "mcf"
         start(release=True)
         assert service.name == ""
+        start()
+
+
+def test_a_robot_that_stands_is_not_dropped() -> None:
+    """Its own controller is not stopped while the legs carry it."""
+    standing = np.array(facts.HOME)
+    with robot(controller="mcf", q=standing) as service:
+        with pytest.raises(Refusal, match=r"does not lie: .._calf is 0.9 rad off .* lay it down first"):
+            start(release=True)
+        assert service.name == "mcf"
+
+
+def test_a_dry_run_asks_nothing_of_the_robot() -> None:
+    """Neither is its controller stopped nor does another one matter, or the battery."""
+    with robot(charge=1, controller="mcf") as service:
+        other = Link(DOMAIN).publisher("rt/lowcmd", LowCmd_)
+        start(release=True, dry_run=True)
+        assert service.name == "mcf"
+        del other
+
+
+def test_frames_of_another_robot() -> None:
+    with robot(broken=True), pytest.raises(Refusal, match="no state frame has a right checksum"):
         start()
