@@ -59,14 +59,21 @@ class Evaluator:
         self.task, self.start, self.size = task, start, sim.num_worlds
         self.sim = sim if task.ensemble is None else task.ensemble.sim(self.size)
         self.rollouts = self.diverged = self.pruned = self.ruled_out = 0
+        self._broke: list[Tensor] = []  # schedules that broke a rule
+        self._barred = np.zeros(len(task.modes), dtype=np.int64)  # those that a guard barred, by its mode
         self._worlds = Worlds(task, self.sim)
-        self._trunk = roots(self._worlds, [start] if task.ensemble is None else task.ensemble.starts(start))
-        if known is not None and len(self._trunk) == 1 and known.meets(self.trunk):
-            self._trunk = (known,)
+        self._root = roots(self._worlds, [start] if task.ensemble is None else task.ensemble.starts(start))
+        if known is not None and len(self._root) == 1 and known.meets(self._root[0]):
+            self._root = (known,)
+        self.renew()
+
+    def renew(self) -> None:
+        """Begin anew, whatever an interrupt left half done; counts go on."""
+        self._trunk = self._root
         self._next: Schedule | None = None  # to be recorded with the next batch
         self._again = False  # it is rolled out with each batch in place of that
         self._traces: dict[int, Callable[[], Traces]] = {}  # of the last batch, where they were kept
-        self._table = Table(len(task.modes), len(task.cost.names))
+        self._table = Table(len(self.task.modes), len(self.task.cost.names))
 
     @property
     def control_steps(self) -> int:
@@ -77,6 +84,16 @@ class Evaluator:
     def own_steps(self) -> int:
         """Those among them that were not made inside a mode."""
         return self._worlds.own_steps
+
+    @property
+    def why_not(self) -> dict[str, int]:
+        """How many of the schedules `ruled_out` each rule bars, a guard by the mode that it is of."""
+        rules, modes, found = self.task.rules, self.task.modes, {}
+        if rules is not None and self._broke:
+            self._broke = [torch.cat(self._broke)]
+            found = rules.reasons(modes, self._broke[0], self.start.mode, self.start.ran)
+        guards = {f"guard of {modes.names[i]}": int(self._barred[i]) for i in self._barred.nonzero()[0]}
+        return found | guards
 
     @property
     def trunk(self) -> Trace:
@@ -244,8 +261,12 @@ class Evaluator:
         rules = self.task.rules
         if rules is None or len(at) == 0:
             return at
-        broken = self._broken(_spelt(_some(schedules, at))).cpu().numpy()
+        asked = _spelt(_some(schedules, at))
+        found = self._broken(asked)
+        broken = found.cpu().numpy()
         out = rows[at[broken]]
+        if len(out) > 0:
+            self._broke.append(asked[found])
         nothing = np.full((len(out), len(self.task.cost.names)), math.nan)
         self._table.learn(out, np.full(len(out), math.inf), np.zeros(len(out), dtype=bool), nothing)
         self.ruled_out += len(out)
@@ -262,14 +283,15 @@ class Evaluator:
         """Take down what the schedule costs that was just recorded, if that is new; its cost."""
         rows = self._table.rows(schedule.tensor()[None])
         if self._table.missing(rows, math.inf)[0]:
-            cost, terms, barred = self.trunk.cost, self.trunk.terms, self.trunk.barred
+            cost, terms = self.trunk.cost, self.trunk.terms
             if self.task.ensemble is not None:
                 costs = torch.tensor([[each.cost for each in self._trunk]], dtype=torch.float64)
                 cost = float(self.task.ensemble.risk(costs)[0])
                 terms = self.task.ensemble.terms(torch.stack([each.terms for each in self._trunk])[None])[0]
-            self.rollouts += 1
-            self.ruled_out += barred
-            self.diverged += not (math.isfinite(cost) or barred)
+            self._tally(
+                np.array([not (math.isfinite(cost) or self.trunk.barred)]),
+                np.array([self.trunk.modes[len(self.trunk)] if self.trunk.barred else -1]),
+            )
             self._table.learn(rows, np.array([cost]), np.array([False]), terms.cpu().numpy()[None])
         return float(self._table.costs(rows, math.inf)[0])
 
@@ -278,12 +300,18 @@ class Evaluator:
         known = 0 if self._table.missing(rows[:1], math.inf)[0] else 1
         ends = (rolled.diverged, rolled.pruned, rolled.barred)
         diverged, pruned, barred = (part[known:].cpu().numpy() for part in ends)
-        self.rollouts += len(rows) - known
-        self.diverged += int(diverged.sum())
         self.pruned += int(pruned.sum())
-        self.ruled_out += int(barred.sum())
+        self._tally(diverged, barred)
         cost, terms = rolled.cost[known:].cpu().numpy(), rolled.terms[known:].cpu().numpy()
         self._table.learn(rows[known:], cost, pruned, terms)
+
+    def _tally(self, diverged: NDArray[np.bool_], barred: NDArray[np.int64]) -> None:
+        """Count schedules just rolled out: who diverged (n,), which mode a guard barred (n,), -1 for none."""
+        self.rollouts += len(diverged)
+        self.diverged += int(diverged.sum())
+        stopped = barred[barred >= 0]
+        self.ruled_out += len(stopped)
+        self._barred += np.bincount(stopped, minlength=len(self._barred))
 
 
 def _spelt(schedules: Tensor | Neighbours) -> Tensor:

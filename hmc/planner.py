@@ -1,4 +1,10 @@
-"""`plan`: from a task and a state to the best schedule that a budget allows, and what backs it."""
+"""`plan`: from a task and a state to the best schedule that a budget allows, and what backs it.
+
+What a schedule K in M^T costs from state x_0 at control step k_0, with dt the duration of a control step:
+
+    J(K) = sum over i = 0 ... T - 1 of l(x_i, u_i, u_(i-1), k_0 + i) dt + c_f(x_T, k_0 + T),
+    u_i = mode K_i at (x_i, u_(i-1), its memory, k_0 + i),  x_(i+1) = the simulator's step from x_i under u_i.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +54,7 @@ class Plan:
             schedules share their beginnings only where a batch fits into the simulator.
         diverged: rollouts with a world that stopped being finite; their cost is inf.
         ruled_out: schedules that the task's rules do not allow; their cost is inf.
+        why_not: how many of these each rule bars, as "dwell of jump": 412; who breaks several counts once.
         fell_back: whether no schedule with a finite cost was found and `schedule` is the rules' fallback.
         stopped_by: "converged", "iterations", "draws", "control_steps", "seconds", "progress" or
             "interrupt"; "" while the search goes on.
@@ -69,6 +76,7 @@ class Plan:
     control_steps: int = field(compare=False)
     diverged: int = field(compare=False)
     ruled_out: int = field(compare=False)
+    why_not: Mapping[str, int] = field(compare=False)
     fell_back: bool
     stopped_by: str
     elapsed: float = field(compare=False)
@@ -101,8 +109,11 @@ class Plan:
 
     @property
     def locally_optimal(self) -> bool:
-        """Whether no single switch improves `schedule` by more than the tolerance (Proposition 1)."""
-        return self.seen == self.space_size
+        """Whether no single switch improves `schedule` by more than the tolerance (Proposition 1).
+
+        Not where its cost is inf: then there is nothing that a switch could be measured by.
+        """
+        return self.seen == self.space_size and math.isfinite(self.cost)
 
     @property
     def machine_dependent(self) -> bool:
@@ -110,6 +121,8 @@ class Plan:
         return self.stopped_by in ("seconds", "progress", "interrupt")
 
     def __str__(self) -> str:
+        reasons = ", ".join(f"{number:,} by {rule}" for rule, number in self.why_not.items())
+        against = f"{self.ruled_out:,} against the rules ({reasons})"
         lines = [
             str(self.schedule)
             + ("  (the fallback: no schedule has a finite cost)" if self.fell_back else ""),
@@ -118,9 +131,15 @@ class Plan:
             + f" of {self.space_size:,} switches",
             f"{self.draws:,} draws, {self.control_steps:,} control steps in {self.elapsed:.3g} s"
             + (f", {self.diverged} rollouts diverged" if self.diverged else "")
-            + (f", {self.ruled_out} schedules against the rules" if self.ruled_out else "")
+            + (f", {against}" if self.ruled_out else "")
             + (f"; stopped by {self.stopped_by}" if self.stopped_by else ""),
         ]
+        if not math.isfinite(self.cost) and not self.fell_back:
+            lines.insert(
+                1,
+                "no schedule tried is feasible: relax the rules, add a mode, or name what is to run then "
+                "with Rules(fallback=...)",
+            )
         if self.switches and math.isfinite(self.incumbent_cost):
             lines.append("by term: " + ", ".join(f"{name} {gain:+.4g}" for name, gain in self.gains.items()))
         if self.machine_dependent:
@@ -129,7 +148,10 @@ class Plan:
 
 
 class PlanInterrupted(KeyboardInterrupt):
-    """Ctrl-C during `plan`: goes on up like any other, with the best plan so far in `plan`."""
+    """Ctrl-C during `plan`: goes on up like any other, with the best plan so far in `plan`.
+
+    Where the incumbent's cost is not known yet, that is rolled out first; a second Ctrl-C ends that too.
+    """
 
     def __init__(self, plan: Plan):
         super().__init__(str(plan))
@@ -245,14 +267,10 @@ def plan(
         ran, x = x.ran, x.x
     start = make_start(task, sim, x, u, mode, memory, k, snapshot, ran)
     meter = Meter(budget or Budget(), Evaluator(task, sim, start, known))
-    incumbent = _incumbent(task, start, mode, schedule)
-    if start.mode is not None and not math.isfinite(meter.evaluator.follow(incumbent)):
-        stay = Schedule.constant(start.mode, task.horizon, task.modes.names)
-        incumbent = stay if math.isfinite(meter.evaluator.follow(stay)) else incumbent
     search = Search(
         meter.evaluator,
         meter,
-        incumbent,
+        _incumbent(task, start, schedule),
         samples,
         tolerance,
         np.random.default_rng(seed),
@@ -262,20 +280,24 @@ def plan(
         max_samples,
     )
     if progress is not None:
-        search.report = lambda search: progress(_plan(search, incumbent))
+        search.report = lambda search: progress(_plan(search))
     try:
+        if start.mode is not None:
+            search.begin()
         run(search, SOLVERS[solver], math.inf if iterations is None else iterations)
-    except KeyboardInterrupt:
         search.begin()
+        search.evaluator.follow(search.schedule)
+        meter.settle()
+        for used in (search.evaluator.sim, *(sim for each in task.modes for sim in each.sims)):
+            tell_overflow(used)
+        return _plan(search)
+    except KeyboardInterrupt:
+        if not search.best.costs:
+            search.evaluator.renew()
+            search.begin()
         search.accept()
-        search.stopped_by = "interrupt"
-        raise PlanInterrupted(_plan(search, incumbent)) from None
-    search.begin()
-    search.evaluator.follow(search.schedule)
-    meter.settle()
-    for used in (search.evaluator.sim, *(sim for each in task.modes for sim in each.sims)):
-        tell_overflow(used)
-    return _plan(search, incumbent)
+        search.stopped_by = search.stopped_by or "interrupt"
+        raise PlanInterrupted(_plan(search)) from None
 
 
 def batch_of(task: Task, solver: str, samples: int | None) -> int:
@@ -291,13 +313,10 @@ def worlds_for(task: Task, samples: int, max_samples: int, beside: int) -> int:
     return single + beside + 1
 
 
-def _incumbent(
-    task: Task, start: Start, mode: int | str | None, schedule: Sequence[int | str] | None
-) -> Schedule:
+def _incumbent(task: Task, start: Start, schedule: Sequence[int | str] | None) -> Schedule:
     names = task.modes.names
     if schedule is None:
-        running = start.mode if mode is None else task.modes.index(mode)
-        return Schedule.constant(running or 0, task.horizon, names)
+        return Schedule.constant(start.mode or 0, task.horizon, names)
     if len(schedule) != task.horizon:
         raise ValueError(
             f"task {task.name!r}: the incumbent schedule has {len(schedule)} steps, expected the horizon, "
@@ -306,26 +325,27 @@ def _incumbent(
     return Schedule(tuple(task.modes.index(item) for item in schedule), names)
 
 
-def _plan(search: Search, incumbent: Schedule) -> Plan:
-    evaluator = search.evaluator
-    schedule, modes, rules = search.schedule, evaluator.task.modes, evaluator.task.rules
-    fallback = None if rules is None or math.isfinite(search.costs[-1]) else rules.fallback
+def _plan(search: Search) -> Plan:
+    evaluator, best = search.evaluator, search.best
+    schedule, modes, rules = best.schedule, evaluator.task.modes, evaluator.task.rules
+    fallback = None if rules is None or math.isfinite(best.costs[-1]) else rules.fallback
     if fallback is not None:
         schedule = Schedule.constant(modes.index(fallback), len(schedule), modes.names)
     return Plan(
         schedule=schedule,
-        terms=evaluator.terms(search.schedule),
-        incumbent=incumbent,
-        incumbent_terms=evaluator.terms(incumbent),
-        switches=tuple(search.switches),
-        costs=tuple(search.costs),
-        seen=search.seen,
+        terms=best.terms,
+        incumbent=best.incumbent,
+        incumbent_terms=best.incumbent_terms,
+        switches=best.switches,
+        costs=best.costs,
+        seen=best.seen,
         space_size=len(search.space),
         draws=search.meter.draws,
         rollouts=evaluator.rollouts,
         control_steps=evaluator.control_steps,
         diverged=evaluator.diverged,
         ruled_out=evaluator.ruled_out,
+        why_not=evaluator.why_not,
         fell_back=fallback is not None,
         stopped_by=search.stopped_by or "",
         elapsed=search.meter.elapsed,

@@ -34,7 +34,7 @@ class Rolled:
         terms: each term's share, (n, number of terms) float64; NaN where diverged or pruned.
         diverged: those with a world whose state, input or cost stopped being finite, (n,) bool.
         pruned: those given up because they are sure to exceed the bound, (n,) bool.
-        barred: those with a world that came to a mode whose guard barred it, (n,) bool; their cost is inf.
+        barred: the mode that a guard barred in one of its worlds, (n,) long; -1 for none. Its cost is inf.
         trace: of the schedule that was to be recorded, one on each member.
         traces: row -> its traces, of every one that was not given up; None where they are too many to keep.
     """
@@ -111,7 +111,7 @@ class _Rollout:
         self.recorder = Recorder(trunk, None if few else self.path) if few or watched else None
         self.terms = np.full((len(task.cost.names), n * self.members), math.nan)  # of those that arrived
         self.result = np.full(n, math.inf)
-        self.pruned, self.barred = np.zeros((2, n), dtype=bool)
+        self.pruned, self.barred = np.zeros(n, dtype=bool), np.full(n, -1)
         self.cheap = worlds.cheap
         self._go_on(slice(0, 0))  # a slice while none has ended
         self.crew: Crew | None = None  # who acts in them; None: to be found out
@@ -171,7 +171,7 @@ class _Rollout:
     def rolled(self, first: int) -> Rolled:
         """What came of the schedules from row `first` on; of row 0 the traces, if it was watched."""
         ended = ~np.isfinite(self.result)
-        diverged = ended & ~self.pruned & ~self.barred
+        diverged = ended & ~self.pruned & (self.barred < 0)
         recorder, tree, barred = self.recorder, self.tree, self.barred
 
         def by_branch(terms: Floats) -> Tensor:
@@ -183,7 +183,7 @@ class _Rollout:
             assert recorder is not None
             path = tree.path(row)
             last = path[-1]
-            return recorder.traces(tuple(tree.modes[last].tolist()), path, ends[last], bool(barred[last]))
+            return recorder.traces(tuple(tree.modes[last].tolist()), path, ends[last], barred[last] >= 0)
 
         at = np.empty(len(tree.row), dtype=np.int64)
         at[tree.row.numpy()] = np.arange(len(at))
@@ -312,7 +312,7 @@ class _Rollout:
 
         What is to be known for that is fetched at once, what the last steps cost included.
         """
-        rules, k, barred, least = self.task.rules, self.first + i, None, None
+        rules, k, none, barred, least = self.task.rules, self.first + i, np.int64(-1), None, None
         if rules is not None and rules.guards:
             modes = self._each(self.modes[i, self.ids])
             barred = rules.barred(self.task.modes, modes != self._before(i), modes, x, k)
@@ -329,7 +329,9 @@ class _Rollout:
             x,
             u,
             sane=self._all(known[1] > 0) if look else None,
-            barred=None if barred is None else ~self._all(known[2] == 0),
+            barred=None
+            if barred is None
+            else np.where(self._all(known[2] == 0), none, self.modes[i, self.ids]),
             least=None if least is None else known[3],
         )
 
@@ -337,12 +339,12 @@ class _Rollout:
         self,
         *rows: Tensor,
         sane: Flags | None = None,
-        barred: Flags | None = None,
+        barred: Indices | None = None,
         least: Floats | None = None,
     ) -> tuple[Tensor, ...]:
-        """End the branches that cost more than the limit or no number, those not `sane` (n,), those `barred`
-        (n,), and those that the `least` (n E,) that is still to come takes beyond the limit; the `rows`,
-        (n E, ...) each, of the others."""
+        """End the branches that cost more than the limit or no number, those not `sane` (n,), those with a
+        mode that is `barred` (n,), not -1, and those that the `least` (n E,) that is still to come takes
+        beyond the limit; the `rows`, (n E, ...) each, of the others."""
         total, there = total_by_term(self.sums), self._indices
         fine = np.ones(self.size, dtype=bool) if sane is None else sane
         if not math.isfinite(total.sum()):
@@ -360,8 +362,8 @@ class _Rollout:
             beyond, over = beyond & free, over & free
         gone = over | ~fine
         if barred is not None:
-            stopped = barred & fine & ~beyond
-            self.barred[there[stopped]] = True
+            stopped = (barred >= 0) & fine & ~beyond
+            self.barred[there[stopped]] = barred[stopped]
             over, gone = over & ~stopped, gone | stopped
         if not gone.any():
             return rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,7 +29,8 @@ class Rules:
         max_changes: most changes of mode within a horizon; None for any number.
         guards: f(x, k) -> (n,) bool, from states x (n, nx) at control steps k (n,): whether the mode may be
             entered there.
-        fallback: the mode that runs if no schedule has a finite cost; None: the incumbent goes on.
+        fallback: the mode that runs if no schedule has a finite cost, whatever the other rules say of it;
+            None: the incumbent goes on.
     """
 
     dwell: Mapping[str, int] = field(default_factory=dict)
@@ -72,7 +73,7 @@ class Rules:
         for one, other in self.forbidden:
             bad |= ((before == modes.index(one)) & (schedules == modes.index(other))).any(1)
         if self.dwell:
-            fewest = torch.ones(len(modes), dtype=torch.long, device=schedules.device)
+            fewest = torch.zeros(len(modes), dtype=torch.long, device=schedules.device)
             for name, steps in self.dwell.items():
                 fewest[modes.index(name)] = steps
             begun = 0 if mode is None else -(horizon + int(fewest.max()) if ran is None else ran)
@@ -81,6 +82,27 @@ class Rules:
             since = torch.cat([torch.full_like(last[:, :1], begun), last[:, :-1]], 1)
             bad |= (change & (step - since < fewest[before])).any(1)
         return bad
+
+    def reasons(self, modes: ModeSet, schedules: Tensor, mode: int | None, ran: int | None) -> dict[str, int]:
+        """How many of schedules (N, T) break each rule, guards aside; who breaks several counts at the first.
+
+        Arguments as of `broken`.
+        """
+        found = {}
+        for name, alone in self._apart():
+            bad = alone.broken(modes, schedules, mode, ran)
+            if bad.any():
+                found[name], schedules = int(bad.sum()), schedules[~bad]
+        return found
+
+    def _apart(self) -> Iterator[tuple[str, Rules]]:
+        """Each rule but the guards by itself, and what it is called."""
+        if self.max_changes is not None:
+            yield f"max_changes {self.max_changes}", Rules(max_changes=self.max_changes)
+        for one, other in self.forbidden:
+            yield f"forbidden {one} to {other}", Rules(forbidden=[(one, other)])
+        for name, steps in self.dwell.items():
+            yield f"dwell of {name}", Rules(dwell={name: steps})
 
     def barred(
         self, modes: ModeSet, entered: NDArray[np.bool_], chosen: NDArray[np.integer], x: Tensor, k: int

@@ -1,10 +1,17 @@
-"""The single-switch problem, and the search that solves it again and again (Algorithms 1 and 2)."""
+r"""The single-switch problem, and the search that solves it again and again (Algorithms 1 and 2).
+
+Problem 5: of a schedule K_def in M^T, the switch that lowers its cost most,
+
+    min over (m, mu, nu) in Omega of J((m, mu, nu) u K_def),
+
+where (m, mu, nu) u K_def runs mode m in steps mu <= k < mu + nu and is K_def elsewhere.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -21,6 +28,29 @@ PARTS = 8  # of a horizon: switches from cut to cut come first, where that shows
 WORTH = 8  # others to each of them, at least: where there are few it takes longer than it saves
 
 
+@dataclass(frozen=True)
+class Standing:
+    """What a search has come to: one value, changed by one assignment, so that Ctrl-C always finds it whole.
+
+    Attributes:
+        incumbent: the schedule that the search began with.
+        incumbent_terms: its cost, term by term, once it is known.
+        schedule: the best schedule so far, K_def of the paper.
+        terms: its cost, term by term, once it is known.
+        costs: the incumbent's cost once it is known, then the cost after each accepted switch or pair.
+        switches: accepted switches.
+        seen: how many switches of `schedule` were evaluated and do not improve it.
+    """
+
+    incumbent: Schedule
+    incumbent_terms: Mapping[str, float]
+    schedule: Schedule
+    terms: Mapping[str, float]
+    costs: tuple[float, ...] = ()
+    switches: tuple[Switch, ...] = ()
+    seen: int = 0
+
+
 @dataclass
 class Search:
     """A search under way: the best schedule so far, and how much of Omega speaks for it.
@@ -28,7 +58,7 @@ class Search:
     Attributes:
         evaluator: gives the cost of schedules.
         meter: what may be spent.
-        schedule: the best schedule so far, K_def of the paper.
+        incumbent: the schedule to begin with.
         samples: N, switches a batch.
         tolerance: a switch counts only when it lowers the cost by more than this share of it.
         rng: where draws come from.
@@ -37,15 +67,14 @@ class Search:
         moves: draws beside each batch that move a stretch of the schedule.
         max_samples: size that batches of one iteration double to; N throughout if that is larger.
         report: told after every batch and accepted switch; False ends the search.
-        costs: the incumbent's cost once it is known, then the cost after each accepted switch or pair.
-        switches: accepted switches.
-        seen: how many switches of `schedule` were evaluated and do not improve it.
         stopped_by: why the search ended; None while it runs.
+        best: what it has come to.
+        ahead: what it comes to if the switch that was taken note of is accepted; None if there is none.
     """
 
     evaluator: Evaluator
     meter: Meter
-    schedule: Schedule
+    incumbent: Schedule
     samples: int
     tolerance: float
     rng: np.random.Generator
@@ -54,33 +83,43 @@ class Search:
     moves: int = 0
     max_samples: int = 0
     report: Callable[[Search], bool | None] = lambda _: None
-    costs: list[float] = field(default_factory=list)
-    switches: list[Switch] = field(default_factory=list)
-    seen: int = 0
     stopped_by: str | None = None
-    _found: tuple[tuple[Switch, ...], float] | None = None
+    best: Standing = field(init=False)
+    ahead: Standing | None = None
     _largest: int = 0
 
     def __post_init__(self) -> None:
-        self.space = SwitchSpace(len(self.evaluator.task.modes), len(self.schedule))
+        self.space = SwitchSpace(len(self.evaluator.task.modes), len(self.incumbent))
+        self.best = Standing(self.incumbent, {}, self.incumbent, {})
+
+    @property
+    def schedule(self) -> Schedule:
+        """The best schedule so far."""
+        return self.best.schedule
 
     @property
     def bound(self) -> float:
         """What a switch has to get below: the best one found, else the schedule's cost less the tolerance."""
-        if self._found is not None:
-            return self._found[1]
-        cost = self.costs[-1] if self.costs else math.inf
+        if self.ahead is not None:
+            return self.ahead.costs[-1]
+        cost = self.best.costs[-1] if self.best.costs else math.inf
         return cost - self.tolerance * abs(cost) if math.isfinite(cost) else cost
 
-    @property
-    def found(self) -> bool:
-        """Whether there is something to accept."""
-        return self._found is not None
-
     def begin(self) -> None:
-        """Find out what the incumbent costs, if that is not known yet."""
-        if not self.costs:
-            self.costs.append(self.evaluator.follow(self.schedule))
+        """Find out what the incumbent costs, if that is not known yet.
+
+        If that is not finite, to stay in the running mode takes its place where that is.
+        """
+        if self.best.costs:
+            return
+        evaluator, incumbent = self.evaluator, self.incumbent
+        cost, mode = evaluator.follow(incumbent), evaluator.start.mode
+        if mode is not None and not math.isfinite(cost):
+            stay = Schedule.constant(mode, len(incumbent), incumbent.names)
+            other = evaluator.follow(stay)
+            incumbent, cost = (stay, other) if math.isfinite(other) else (incumbent, cost)
+        terms = evaluator.terms(incumbent)
+        self.best = Standing(incumbent, terms, incumbent, terms, (cost,))
 
     def batches(
         self, order: Draws | TailsFirst | InOrder, beside: bool = False
@@ -91,7 +130,7 @@ class Search:
         of that: see `hmc.moves`. All of it is rolled out together, which takes least time.
         """
         waiting, size = torch.empty(0, dtype=torch.long), self.samples
-        if self.costs:
+        if self.best.costs:
             self.evaluator.follow(self.schedule)
         else:
             self.evaluator.aim(self.schedule)
@@ -120,7 +159,7 @@ class Search:
             costs = self._roll(batch[: room + len(pairs)])
             self.begin()
             known = ~costs.isnan()
-            self.seen += int(known[:room].sum())
+            self.best = replace(self.best, seen=self.best.seen + int(known[:room].sum()))
             found = torch.where(known, costs, math.inf)
             yield indices, found[:room], pairs, found[room:]
             if self.stopped_by or not known.all():
@@ -129,19 +168,27 @@ class Search:
             size = max(self.samples, min(2 * size, self.max_samples))
             self.tell()
 
-    def offer(self, switches: Sequence[Switch], cost: float, replace: bool = False) -> None:
+    def offer(self, switches: Sequence[Switch], cost: float, equal: bool = False) -> None:
         """Take note of one switch, or of some that are stitched one after the other, if below `bound`.
 
-        With `replace`, also of what costs the same as what was noted before.
+        With `equal`, also of what costs the same as what was noted before.
         """
-        if cost < self.bound or (replace and self.found and cost == self.bound):
-            self._found = tuple(switches), cost
+        if cost < self.bound or (equal and self.ahead is not None and cost == self.bound):
+            best, schedule = self.best, self._stitched(switches)
+            self.ahead = Standing(
+                best.incumbent,
+                best.incumbent_terms,
+                schedule,
+                self.evaluator.terms(schedule),
+                (*best.costs, cost),
+                (*best.switches, *switches),
+            )
 
     def _pairs(self, ahead: int) -> Pairs:
         """What is tried beside a batch of `ahead` draws."""
         k = self.evaluator.start.k
         room = self.meter.room(ahead + self.pairs + self.moves)[0] - ahead
-        tried = handovers(self.space, k, k + len(self.switches), min(self.pairs, room))
+        tried = handovers(self.space, k, k + len(self.best.switches), min(self.pairs, room))
         return tried + moves(self.schedule, self.rng, min(self.moves, room - len(tried)))
 
     def _stitched(self, switches: Sequence[Switch]) -> Schedule:
@@ -160,13 +207,9 @@ class Search:
 
     def accept(self) -> bool:
         """Go on from the switch taken note of: K_def <- (m, mu, nu) u K_def. False if there is none."""
-        if self._found is None:
+        if self.ahead is None:
             return False
-        switches, cost = self._found
-        self.schedule = self._stitched(switches)
-        self.switches += switches
-        self.costs.append(cost)
-        self.seen, self._found = 0, None
+        self.best, self.ahead = self.ahead, None
         return True
 
     def tell(self) -> None:
@@ -188,7 +231,7 @@ def sample(search: Search) -> None:
         if pairs:
             best = theirs.argmin()
             search.offer(pairs[int(best)], float(theirs[best]))
-        if search.found:
+        if search.ahead is not None:
             return
 
 
@@ -210,7 +253,7 @@ def exhaustive(search: Search) -> None:
         here = float(costs[best]), int(indices[best])
         if here < lowest:
             lowest = here
-            search.offer([search.space[here[1]]], here[0], replace=True)
+            search.offer([search.space[here[1]]], here[0], equal=True)
 
 
 def _tails(search: Search) -> TailsFirst:
@@ -228,7 +271,7 @@ SOLVERS: dict[str, Callable[[Search], None]] = {"sample": sample, "exhaustive": 
 def run(search: Search, solve: Callable[[Search], None], iterations: float) -> None:
     """Algorithm 1: solve the single-switch problem and stitch, until no switch improves."""
     while search.stopped_by is None:
-        if len(search.switches) >= iterations:
+        if len(search.best.switches) >= iterations:
             search.stopped_by = "iterations"
             return
         solve(search)

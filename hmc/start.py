@@ -39,6 +39,7 @@ class Start:
     ran: int | None = None
 
 
+@torch.no_grad()
 def make_start(
     task: Task,
     sim: Sim,
@@ -52,7 +53,7 @@ def make_start(
 ) -> Start:
     """A `Start` in the simulator's type and on its device, from values that are checked.
 
-    A running mode that has memory is taken to be entered anew if its memory is not given.
+    A running mode whose memory is not given gets that of an entry now; for rules it goes on running.
     """
     x = _vector(f"task {task.name!r}: state x", x, sim.nx, sim)
     u = _vector(f"task {task.name!r}: last input u", [0.0] * sim.nu if u is None else u, sim.nu, sim)
@@ -67,8 +68,7 @@ def make_start(
     index = task.modes.index(mode)
     running = task.modes[index]
     if memory is None:
-        known = None if running.memory_size else index
-        return Start(x, u, known, x.new_zeros(0), k, snapshot, ran)
+        memory = running.reset(x[None], u[None], torch.tensor([k], device=x.device))[0]
     memory = _vector(f"memory of mode {running.name!r}", memory, running.memory_size, sim)
     return Start(x, u, index, memory, k, snapshot, ran)
 

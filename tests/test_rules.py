@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hmc import Budget, Evaluator, ModeSet, Receding, Rules, Schedule, Task, make_start, plan
+from hmc import Budget, Ensemble, Evaluator, ModeSet, Receding, Rules, Schedule, Task, make_start, plan
+from tests.naive import allowed, naive_cost
 from tests.toy import COST, Damp, Push, Ramp, ToySim, all_schedules, toy_task
 
 FAR = [1.5, 1.0]
@@ -21,28 +24,43 @@ def ruled(rules: Rules, horizon: int = 6) -> Task:
     return Task("toy", ModeSet([Push(1.0), Damp(), Ramp()]), COST, horizon, ToySim, rules)
 
 
-def allowed(rules: Rules, row: tuple[int, ...], mode: int | None, ran: int | None) -> bool:
-    """By the definition, one step at a time."""
-    changes, count = 0, ran if ran is not None else math.inf
-    for i, chosen in enumerate(row):
-        if i == 0 and mode is None:
-            count = 0
-        elif mode is not None and chosen != mode:
-            if count < rules.dwell.get(NAMES[mode], 1) or (NAMES[mode], NAMES[chosen]) in rules.forbidden:
-                return False
-            changes, count = changes + 1, 0
-        mode, count = chosen, count + 1
-    return rules.max_changes is None or changes <= rules.max_changes
+def low(x, k):
+    """A guard on the state."""
+    return x[:, 0] < 1.3
+
+
+def late(x, k):
+    """And one on the control step."""
+    return k >= 2
 
 
 @st.composite
-def some_rules(draw):
+def some_rules(draw, guards=False):
     pairs = st.sampled_from(list(itertools.permutations(NAMES, 2)))
+    some = st.dictionaries(st.sampled_from(NAMES), st.sampled_from([low, late]), max_size=2)
     return Rules(
         dwell=draw(st.dictionaries(st.sampled_from(NAMES), st.integers(1, 4))),
         forbidden=draw(st.frozensets(pairs, max_size=3)),
         max_changes=draw(st.none() | st.integers(0, 3)),
+        guards=draw(some) if guards else {},
     )
+
+
+def toys(which):
+    """Members of an ensemble: one gives way where the other does not."""
+    return ToySim(len(which), hidden=[0.3 * each for each in which])
+
+
+searches = st.fixed_dictionaries(
+    {
+        "solver": st.sampled_from(["sample", "exhaustive"]),
+        "order": st.sampled_from(["uniform", "tails"]),
+        "samples": st.sampled_from([4, 8, 40]),
+        "max_samples": st.sampled_from([0, 32]),
+        "pairs": st.sampled_from([0, 4]),
+        "moves": st.sampled_from([0, 3]),
+    }
+)
 
 
 @given(rules=some_rules(), mode=st.none() | st.integers(0, 2), ran=st.none() | st.integers(0, 5))
@@ -50,22 +68,36 @@ def test_rules_against_their_definition(rules, mode, ran):
     rows = all_schedules(3, 5)
     broken = rules.broken(ModeSet([Push(1.0), Damp(), Ramp()]), rows, mode, ran)
     assert [not bad for bad in broken.tolist()] == [
-        allowed(rules, tuple(row), mode, ran) for row in rows.tolist()
+        allowed(rules, NAMES, row, mode, ran) for row in rows.tolist()
     ]
     if mode is not None:
         assert not broken[(rows == mode).all(1)].any(), "to stay breaks no rule"
 
 
 @settings(max_examples=40)
-@given(rules=some_rules(), solver=st.sampled_from(["sample", "exhaustive"]), seed=st.integers(0, 9))
-def test_no_plan_breaks_a_rule(rules, solver, seed):
-    found = plan(ruled(rules), FAR, mode="damp", ran=1, solver=solver, samples=8, seed=seed)
+@given(
+    rules=some_rules(guards=True),
+    options=searches,
+    seed=st.integers(0, 9),
+    mode=st.integers(0, 2),
+    members=st.sampled_from([0, 2]),
+    ran=st.none() | st.integers(0, 3),
+)
+def test_no_plan_breaks_a_rule(rules, options, seed, mode, members, ran):
+    """Nor does any schedule on the way there, whatever the search; ramp may run, its memory not given."""
+    task = replace(ruled(rules), ensemble=Ensemble(2, toys) if members else None)
+    found = plan(task, FAR, mode=mode, ran=ran, seed=seed, **options)
+    start = make_start(task, task.make_sim(1), FAR, mode=mode, ran=ran)
     assert math.isfinite(found.cost)
-    assert allowed(rules, found.schedule.modes, 1, 1)
-    schedule = found.incumbent
-    for switch in found.switches:
-        schedule = schedule.stitch(switch)
-        assert allowed(rules, schedule.modes, 1, 1)
+    assert allowed(rules, NAMES, found.schedule.modes, mode, ran)
+    assert found.cost == naive_cost(task, found.schedule.modes, start), "which asks the guards too"
+    assert found.ruled_out == sum(found.why_not.values())
+    schedule, switches, costs = found.incumbent, list(found.switches), list(found.costs)
+    while switches:
+        schedule = schedule.stitch(switches.pop(0))
+        assert allowed(rules, NAMES, schedule.modes, mode, ran) or options["pairs"] or options["moves"]
+    assert schedule == found.schedule
+    assert costs == sorted(costs, reverse=True)
 
 
 def test_without_rules_in_the_way_the_plan_is_the_same():
@@ -75,12 +107,19 @@ def test_without_rules_in_the_way_the_plan_is_the_same():
 
 
 @settings(max_examples=20)
-@given(rules=some_rules())
-def test_a_loop_never_breaks_a_rule(rules):
-    loop, sim, ran = Receding(ruled(rules), samples=6, budget=Budget(draws=12)), ToySim(1), []
+@given(rules=some_rules(guards=True), options=searches)
+def test_a_loop_never_breaks_a_rule(rules, options):
+    """What ran, and of each plan what is still to come; guards hold where a mode was truly entered."""
+    rules = replace(rules, guards={name: f for name, f in rules.guards.items() if name != "push1"})
+    loop, sim, ran = Receding(ruled(rules), budget=Budget(draws=12), **options), ToySim(1), []
     sim.reset(torch.tensor([FAR]), torch.zeros(1, 1))
-    for _ in range(15):
-        tick = loop.tick(sim.x()[0], snapshot=sim.save()[0])
+    for k in range(15):
+        x, mode, since = sim.x(), loop.running.mode, loop.running.ran
+        tick = loop.tick(x[0], snapshot=sim.save()[0])
+        assert math.isfinite(tick.plan.cost)
+        assert allowed(rules, NAMES, tick.plan.schedule.modes, mode, since)
+        guard = rules.guards.get(NAMES[tick.mode])
+        assert tick.mode == mode or guard is None or bool(guard(x, torch.tensor([k]))[0])
         sim.step(tick.u[None])
         ran.append(tick.mode)
     runs = [(mode, len(list(steps))) for mode, steps in itertools.groupby(ran)]
@@ -88,6 +127,74 @@ def test_a_loop_never_breaks_a_rule(rules):
         assert steps >= rules.dwell.get(NAMES[mode], 1)
     for (one, _), (other, _) in itertools.pairwise(runs):
         assert (NAMES[one], NAMES[other]) not in rules.forbidden
+
+
+def test_a_running_mode_with_memory_that_is_not_given_runs_on():
+    """Its memory is made anew; dwell, forbidden changes and guards know all the same that it runs."""
+    guards = {"ramp": lambda x, k: torch.zeros(len(x), dtype=torch.bool)}
+    for rules in (Rules(dwell={"ramp": 3}), Rules(forbidden=[("ramp", "damp")]), Rules(guards=guards)):
+        task = ruled(rules)
+        start = make_start(task, task.make_sim(1), FAR, mode="ramp", ran=1, k=4)
+        assert (start.mode, start.ran, start.memory.tolist()) == (2, 1, [0.0, 1.5, 0.0, 4.0])
+        rows = all_schedules(3, 6)
+        costs = Evaluator(task, task.make_sim(64), start).costs(rows)
+        expected = [naive_cost(task, row, start) for row in rows.tolist()]
+        assert costs.tolist() == expected
+        assert 0 < sum(cost == math.inf for cost in expected) < len(rows)
+        assert math.isfinite(plan(task, FAR, mode="ramp", ran=1, k=4).cost), "to stay may"
+    found = plan(ruled(Rules(dwell={"ramp": 3})), FAR, mode="ramp", ran=1)
+    assert found.schedule.modes[:2] == (2, 2)
+    assert found.why_not == {"dwell of ramp": found.ruled_out}
+
+
+def test_why_not_counts_each_schedule_at_the_first_rule_that_it_breaks():
+    rules = Rules(
+        dwell={"ramp": 2, "damp": 3}, forbidden=[("push1", "ramp")], max_changes=2, guards={"damp": late}
+    )
+    task, rows = ruled(rules, 4), all_schedules(3, 4)
+    evaluator = Evaluator(task, task.make_sim(100), make_start(task, task.make_sim(1), FAR))
+    evaluator.costs(rows)
+    expected: Counter[str] = Counter()
+    for row in rows.tolist():
+        alone = {
+            "max_changes 2": Rules(max_changes=2),
+            "forbidden push1 to ramp": Rules(forbidden=rules.forbidden),
+            "dwell of ramp": Rules(dwell={"ramp": 2}),
+            "dwell of damp": Rules(dwell={"damp": 3}),
+        }
+        broken = [name for name, one in alone.items() if not allowed(one, NAMES, row, None, None)]
+        if not broken and any(row[i] == 1 and (i == 0 or row[i - 1] != 1) for i in range(2)):
+            broken = ["guard of damp"]
+        expected.update(broken[:1])
+    assert evaluator.why_not == expected
+    assert len(expected) == 5
+    assert evaluator.ruled_out == expected.total()
+    one = Evaluator(task, task.make_sim(1), make_start(task, task.make_sim(1), FAR))
+    for row in rows.tolist():  # one by one they are recorded
+        one.follow(Schedule(tuple(row)))
+    assert one.why_not == expected
+
+
+def test_where_nothing_is_feasible_the_plan_says_why():
+    def nowhere(x, k):
+        return torch.zeros(len(x), dtype=torch.bool)
+
+    rules = Rules(guards=dict.fromkeys(NAMES, nowhere), forbidden=[("push1", "ramp")])
+    found = plan(ruled(rules), FAR, solver="exhaustive")
+    assert found.cost == math.inf
+    assert found.seen == found.space_size
+    assert not found.locally_optimal, "there is nothing that a switch could be measured by"
+    assert set(found.why_not) == {
+        "guard of push1",
+        "guard of damp",
+        "guard of ramp",
+        "forbidden push1 to ramp",
+    }
+    assert sum(found.why_not.values()) == found.ruled_out
+    text = str(found)
+    assert "no schedule tried is feasible: relax the rules" in text
+    assert f"{found.why_not['guard of ramp']} by guard of ramp" in text
+    assert "locally optimal" not in text
 
 
 def test_a_guard_bars_the_entry_and_only_that():

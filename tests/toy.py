@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-import operator
 from collections.abc import Sequence
-from functools import reduce
 
 import torch
 from torch import Tensor
 
 from hmc.cost import Cost
 from hmc.modes import Mode, ModeSet
+from hmc.start import make_start
 from hmc.task import Task
+from tests.naive import naive_cost
 
 
 class ToySim:
@@ -138,24 +138,8 @@ def toy_task(horizon: int = 6, modes: list[Mode] | None = None, cost: Cost = COS
 
 
 def slow_cost(task: Task, modes, x, u=(0.0,), mode=None, memory=None, k=0) -> float:
-    """J of one schedule by its definition, one world, one step at a time."""
-    sim = task.make_sim(1)
-    sim.reset(torch.tensor([x], dtype=torch.float64), torch.tensor([u], dtype=torch.float64))
-    memory = None if memory is None else torch.as_tensor(memory, dtype=torch.float64)[None]
-    sums = [0.0] * len(task.cost.names)
-    for i, index in enumerate(modes):
-        now, state, before = torch.tensor([k + i]), sim.x(), sim.u()
-        if index != mode:
-            memory = task.modes[index].reset(state, before, now)
-        action, memory = task.modes[index].act(state, before, memory, now)
-        for j, term in enumerate(task.cost.stage.values()):
-            sums[j] += float(term(state, action, before, now)[0]) * sim.dt
-        sim.step(action)
-        mode = index
-    for j, final in enumerate(task.cost.terminal.values(), len(task.cost.stage)):
-        sums[j] = float(final(sim.x(), torch.tensor([k + len(modes)]))[0])
-    cost = reduce(operator.add, sums)  # sum() compensates what rounding loses since Python 3.12
-    return cost if math.isfinite(cost) else math.inf
+    """J of one schedule by its definition, see `naive_cost`."""
+    return naive_cost(task, modes, make_start(task, task.make_sim(1), x, u, mode, memory, k))
 
 
 def all_schedules(num_modes: int, horizon: int) -> Tensor:
