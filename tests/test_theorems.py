@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from hmc import Budget, Evaluator, Schedule, Switch, SwitchSpace, make_start, plan
+from hmc import Budget, Ensemble, Evaluator, Rules, Schedule, Switch, SwitchSpace, make_start, plan
 from hmc.cost import Cost
 from hmc.modes import Mode
 from hmc.task import Task
-from tests.toy import Push, Ramp, all_schedules, toy_task
+from tests.toy import Push, Ramp, ToySim, all_schedules, toy_task
 
 
 class RandomFeedback(Mode):
@@ -157,13 +157,36 @@ def test_a_pair_gets_past_what_no_single_switch_improves():
     assert freed.cost == min(brute_force(task, x).values()) < stuck.cost
 
 
+searches = st.fixed_dictionaries(
+    {
+        "solver": st.sampled_from(["sample", "exhaustive"]),
+        "samples": st.integers(2, 40),
+        "max_samples": st.sampled_from([0, 30]),
+        "order": st.sampled_from(["uniform", "tails"]),
+        "pairs": st.sampled_from([0, 4]),
+        "moves": st.sampled_from([0, 3]),
+        "mode": st.sampled_from([None, "random1", "ramp"]),
+        "ran": st.just(1),
+    }
+)
+some_rules = st.builds(
+    Rules,
+    dwell=st.sampled_from([{}, {"ramp": 2}, {"random0": 3}]),
+    forbidden=st.sampled_from([(), [("ramp", "random0")]]),
+    max_changes=st.sampled_from([None, 1, 2]),
+    guards=st.sampled_from([{}, {"random1": lambda x, k: x[:, 0] < 0.5}]),
+)
+
+
 @given(
     system=st.tuples(st.integers(0, 9999), st.integers(1, 5)),
-    solver=st.sampled_from(["sample", "exhaustive"]),
-    samples=st.integers(2, 40),
+    options=searches,
+    rules=st.none() | some_rules,
+    members=st.sampled_from([0, 0, 2]),
+    tail=st.sampled_from([0.0, 0.7, 1.0]),
 )
 @settings(max_examples=200)
-def test_pruning_never_changes_a_plan(system, solver, samples):
+def test_pruning_never_changes_a_plan(system, options, rules, members, tail):
     """Without pruning, with it, and with a lower bound: what the next step's state is sure to cost."""
     task, x, incumbent = random_task(*system)
     stage = {name: lambda *args, f=f: 1.0 + f(*args) for name, f in task.cost.stage.items()}
@@ -172,9 +195,17 @@ def test_pruning_never_changes_a_plan(system, solver, samples):
     def ahead(x, k, steps):
         return 0.5 * bowl(x, None, None, k) if steps > 0 else torch.zeros(len(x))
 
-    plain = replace(task, cost=Cost(stage, task.cost.terminal))
-    pruned = replace(task, cost=Cost(stage, task.cost.terminal, nonnegative=True))
-    options = {"schedule": incumbent, "solver": solver, "samples": samples, "iterations": 2}
+    others = Ensemble(2, lambda which: ToySim(len(which), [0.3 * e for e in which]), tail=tail)
+    plain = replace(
+        task,
+        cost=Cost(stage, task.cost.terminal),
+        rules=rules,
+        ensemble=others if members else None,
+    )
+    pruned = replace(plain, cost=Cost(stage, task.cost.terminal, nonnegative=True))
+    options = {**options, "schedule": incumbent, "iterations": 2}
+    if options["mode"] is None:
+        del options["ran"]
     first, second, third = (
         plan(each, x, **options) for each in (plain, pruned, replace(pruned, lower_bound=ahead))
     )
