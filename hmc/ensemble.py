@@ -1,4 +1,10 @@
-"""Robust planning: the models that schedules are rolled out on, and how their costs become one."""
+"""Robust planning: the models that schedules are rolled out on, and how their costs become one.
+
+Of costs J_1 >= J_2 >= ... >= J_E, one a member, what counts is their conditional value at risk at a tail
+alpha, the mean of the worst share alpha: with m = max(1, alpha E),
+
+    CVaR = min over c of c + 1 / m sum_e max(J_e - c, 0) = 1 / m sum_e min(1, max(0, m - e + 1)) J_e.
+"""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def mppi(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor
 
 
 def cem(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor | None]:
-    """The cross-entropy method (Rubinstein 1999): mean and standard deviation of the elites; as `mppi`."""
+    """The cross-entropy method (Rubinstein 1999): mean and deviation of eps_s, s in the elites; as `mppi`."""
     order = costs.argsort(dim=1, stable=True)[:, : cfg.elites]
     has_say = costs.gather(1, order).isfinite()[:, :, None, None]
     elites = noise.gather(1, order[:, :, None, None].expand(-1, -1, *noise.shape[2:])) * has_say
@@ -108,7 +108,7 @@ def cem(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor 
 
 
 def ps(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Predictive sampling (Howell et al. 2022): the best sample; as `mppi`."""
+    """Predictive sampling (Howell et al. 2022): eps_s of the best sample, s = argmin J_s; as `mppi`."""
     best = costs.argmin(1)
     has_say = costs.gather(1, best[:, None]).isfinite()[:, :, None]
     return noise[torch.arange(len(noise), device=noise.device), best] * has_say, None
