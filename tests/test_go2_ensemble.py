@@ -89,6 +89,17 @@ def test_members_differ_and_are_the_same_for_a_seed():
     assert make_ensemble(EnsembleCfg()) is None
 
 
+def test_all_members_have_the_planning_model_s_contacts(tmp_path):
+    policy = str(write_random_policy(tmp_path / "random.onnx", hidden=(8,)))
+    cfg = FlipCfg(horizon=4, foot=policy, hand=policy, ensemble=EnsembleCfg(members=2), contacts="feet")
+    task = flip_task(cfg, threads=1)
+    assert task.ensemble is not None
+    for sim in (task.make_sim(1), task.ensemble.sim(2)):
+        assert isinstance(sim, MujocoSim)
+        for model in [sim.model, *(sim.batch.models or ())]:
+            assert {model.geom(i).name[3:] for i in np.flatnonzero(model.geom_conaffinity)} == {"foot"}
+
+
 def test_a_flip_is_planned_on_all_members(tmp_path):
     policy = str(write_random_policy(tmp_path / "random.onnx", hidden=(8,)))
     cfg = FlipCfg(horizon=4, command=2, foot=policy, hand=policy, ensemble=EnsembleCfg(members=2))

@@ -144,6 +144,39 @@ def test_each_foot(ours, leg):
     assert foot.friction[0] == pytest.approx(0.8)
 
 
+@pytest.mark.parametrize("contacts", ["all", "body", "feet"])
+def test_what_the_floor_holds_up(contacts):
+    """Dropped on its back with its legs folded below it, a robot rests on what may touch the ground."""
+    model = load_model(contacts=contacts)
+    data = mujoco.MjData(model)
+    data.qpos[2:7], data.qpos[7:] = [0.3, 0, 1, 0, 0], np.tile([0.0, 1.4, -2.7], 4)
+    data.ctrl[:] = data.qpos[7:]
+    mujoco.mj_step(model, data, 300)
+    held = {model.geom(geom).name for contact in data.contact for geom in contact.geom} - {"floor"}
+    assert (data.qpos[2] > 0.04) == (contacts != "feet"), "else its trunk is below the floor"
+    assert ("trunk" in held) == (contacts != "feet")
+    assert not any("thigh" in name or "calf" in name for name in held) or contacts == "all"
+
+
+@pytest.mark.parametrize("contacts", ["all", "body", "feet"])
+def test_feet_stand_whatever_else_may_touch(contacts):
+    """Only what may touch differs: standing on four feet is the same to the bit."""
+    whole, model = load_model(), load_model(contacts=contacts)
+    ends = []
+    for each in (whole, model):
+        data = mujoco.MjData(each)
+        data.qpos[2], data.qpos[7:] = 0.29, np.tile([0.0, 0.9, -1.8], 4)
+        data.ctrl[:] = data.qpos[7:]
+        mujoco.mj_step(each, data, 100)
+        assert data.ncon == 4
+        ends.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_array_equal(*ends)
+    limbs = [model.geom(f"{leg}_{part}").conaffinity[0] for leg in LEGS for part in ("hip", "thigh", "calf")]
+    body = [model.geom(name).conaffinity[0] for name in ("trunk", "head", "chin")]
+    assert limbs == [int(contacts == "all")] * 12
+    assert body == [int(contacts != "feet")] * 3
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_mass_matrix(ours, published, seed):
     """The whole 18 x 18 inertia matrix and the links' places at a random pose."""

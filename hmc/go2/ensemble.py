@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hmc.ensemble import Ensemble
-from hmc.go2.model import SUBSTEPS, load_model
+from hmc.go2.model import SUBSTEPS, Contacts, load_model
 from hmc.go2.variants import VariantsCfg, draw
 from hmc.sim.base import Sim
 from hmc.sim.make import make_sim
@@ -48,6 +48,7 @@ def make_ensemble(
     seed: int = 0,
     substeps: int = SUBSTEPS,
     iterations: int | None = None,
+    contacts: Contacts = "all",
     threads: int = 0,
     engine: str = "mujoco",
     device: str = "",
@@ -60,13 +61,14 @@ def make_ensemble(
     def uniform(width: float, n: int) -> Tensor:
         return width * (2 * torch.rand(n, generator=generator, dtype=torch.float64) - 1)
 
-    models, late, errors = [load_model(substeps, iterations)], [0], [torch.zeros(37, dtype=torch.float64)]
+    coarse = substeps, iterations, contacts
+    models, late, errors = [load_model(*coarse)], [0], [torch.zeros(37, dtype=torch.float64)]
     for variant in draw(cfg.variants, cfg.members, generator):
         error = torch.zeros(37, dtype=torch.float64)
         # the robot is where it measures itself less the error of its zeros
         error[7:19] = uniform(cfg.joints, 12) - torch.tensor(variant.zeros, dtype=torch.float64)
         error[19:22] = uniform(cfg.velocity, 3)
-        models.append(variant.model(substeps, iterations))
+        models.append(variant.model(*coarse))
         late.append(variant.late(substeps))
         errors.append(error)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import resources
+from typing import Literal
 
 import mujoco
 import torch
@@ -40,19 +41,30 @@ Q_LOWER, Q_UPPER = torch.tensor(facts.Q_LOWER), torch.tensor(facts.Q_UPPER)
 GEAR = torch.tensor(facts.GEAR)
 HOME = torch.tensor(facts.HOME)
 HANDSTAND, FOOTSTAND = torch.tensor(facts.HANDSTAND), torch.tensor(facts.FOOTSTAND)
+Contacts = Literal["all", "body", "feet"]
 
 
-def load_model(substeps: int = SUBSTEPS, iterations: int | None = None) -> mujoco.MjModel:
+def load_model(
+    substeps: int = SUBSTEPS, iterations: int | None = None, contacts: Contacts = "all"
+) -> mujoco.MjModel:
     """The compiled model (nq 19, nv 18, nu 12), with so many physics steps a control step of 20 ms.
 
     Args:
         substeps: physics steps a control step; fewer make a coarser model.
         iterations: of the contact solver, at most; None for the model file's.
+        contacts: what the floor holds up: all of the robot; "body": feet, trunk and head, but no hip, thigh
+            or shin; "feet": these alone. The rest goes through the floor.
     """
     model = mujoco.MjModel.from_xml_path(str(resources.files("hmc.go2") / "go2.xml"))
     model.opt.timestep = DT / substeps
     if iterations is not None:
         model.opt.iterations = iterations
+    if contacts != "all":
+        base = model.body("base").id
+        for geom in range(model.ngeom):
+            foot, trunk = model.geom_priority[geom] == 1, model.geom_bodyid[geom] == base
+            if not foot and not (contacts == "body" and trunk):
+                model.geom_conaffinity[geom] = 0
     return model
 
 

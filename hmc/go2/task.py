@@ -100,6 +100,7 @@ class FlipCfg:
         hand: policy file of the handstand, likewise.
         substeps: physics steps a control step of the planner's model; the robot's own has 4.
         iterations: of the contact solver in the planner's model, at most; None for the robot's own.
+        contacts: what the floor holds up in the planner's model, see `hmc.go2.model.load_model`.
         ensemble: other models that schedules are judged on as well.
         engine: that the planner rolls out on: mujoco, or warp for a GPU, or auto.
         device: of the engine; empty for its own, as in `hmc.sim.make.make_sim`.
@@ -115,6 +116,7 @@ class FlipCfg:
     hand: str = ""
     substeps: int = go2.SUBSTEPS
     iterations: int | None = None
+    contacts: go2.Contacts = "all"
     ensemble: EnsembleCfg = field(default_factory=EnsembleCfg)
     engine: Literal["mujoco", "warp", "auto"] = "mujoco"
     device: str = ""
@@ -328,9 +330,10 @@ def make_sim(
     threads: int = 0,
     engine: str = "mujoco",
     device: str = "",
+    contacts: go2.Contacts = "all",
 ) -> Sim:
     """Worlds of the Go2; see `hmc.go2.model.load_model` and `hmc.sim.make.make_sim` (device "": none)."""
-    model = go2.load_model(substeps, iterations)
+    model = go2.load_model(substeps, iterations, contacts)
     return engines.make_sim(
         model, num_worlds, engine, device=device or None, substeps=substeps, threads=threads
     )
@@ -349,7 +352,7 @@ def flip_task(cfg: FlipCfg, *, seed: int = 0, threads: int = 0) -> Task:
     """
     engines.choose(cfg.engine, cfg.device or None)
     coarse: dict[str, Any] = {"substeps": cfg.substeps, "iterations": cfg.iterations, "threads": threads}
-    coarse |= {"engine": cfg.engine, "device": cfg.device}
+    coarse |= {"engine": cfg.engine, "device": cfg.device, "contacts": cfg.contacts}
     sim = partial(make_sim, **coarse)
     modes = ModeSet(
         [

@@ -9,7 +9,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from hmc.go2.model import DT, SUBSTEPS, load_model
+from hmc.go2.model import DT, SUBSTEPS, Contacts, load_model
 
 
 @dataclass(frozen=True)
@@ -73,12 +73,14 @@ class Variant:
     latency: float = 0.0
     zeros: tuple[float, ...] = (0.0,) * 12
 
-    def model(self, substeps: int = SUBSTEPS, iterations: int | None = None) -> mujoco.MjModel:
+    def model(
+        self, substeps: int = SUBSTEPS, iterations: int | None = None, contacts: Contacts = "all"
+    ) -> mujoco.MjModel:
         """Its compiled model; arguments as of `load_model`. Latency and zeros are not part of it.
 
         The motors give `strength` times the torque, and their limits are as many times the nominal ones.
         """
-        model = load_model(substeps, iterations)
+        model = load_model(substeps, iterations, contacts)
         feet = [i for i in range(model.ngeom) if model.geom_priority[i] == 1]
         model.geom_friction[feet, 0] = self.friction
         base = model.body("base").id
