@@ -16,6 +16,7 @@ from hmc.cost import Cost, total
 from hmc.modes import Mode
 from hmc.sim.base import Sim, rollout
 from hmc.sim.device import upload
+from hmc.spline import interpolate, nearest, spline
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,7 @@ class SamplingMpc(Mode):
         self.memory_size = cfg.knots * self.nu + 1
         self._make_sim = make_sim
         self._sim: Sim | None = None
-        self.spline = _spline(cfg.horizon, cfg.knots)
+        self.spline = spline(cfg.horizon, cfg.knots)
         self._known: dict[bytes, Tensor] = {}
         self._there: dict[tuple[torch.device, torch.dtype], Constants] = {}
 
@@ -237,7 +238,9 @@ class SamplingMpc(Mode):
         self._known.clear()
 
     @torch.no_grad()
-    def solve(self, x: Tensor, u: Tensor, control_steps: int, k: int = 0) -> Solution:
+    def solve(
+        self, x: Tensor, u: Tensor, control_steps: int, k: int = 0, guess: Tensor | None = None
+    ) -> Solution:
         """The planner on its own: updates from the first plan on, until the budget is used up.
 
         Args:
@@ -245,9 +248,20 @@ class SamplingMpc(Mode):
             u: input applied last, (nu,).
             control_steps: budget; an update takes S H of them, and one at least is made.
             k: control step since the start of the task.
+            guess: inputs (H, nu) to begin from, such as an earlier solution's: the spline nearest to them is
+                the first plan. Left out, it begins as the mode does when it is entered.
+
+        Raises:
+            ValueError: a guess of another shape, or one that is not finite.
         """
         step, its = torch.tensor([k]), self._constants(x)
-        theta = self.reset(x[None], u[None], step)[:, :-1].reshape(1, self.cfg.knots, self.nu)
+        if guess is None:
+            theta = self.reset(x[None], u[None], step)[:, :-1].reshape(1, self.cfg.knots, self.nu)
+        else:
+            expected = self.cfg.horizon, self.nu
+            if guess.shape != expected or not guess.isfinite().all():
+                raise ValueError(f"guess: expected {expected} finite inputs, got shape {tuple(guess.shape)}")
+            theta = nearest(its.spline, guess.to(x))[None]
         std, best = None, (math.inf, theta[0])
         updates = max(1, control_steps // (self.cfg.samples * self.cfg.horizon))
         for iteration in range(updates):
@@ -265,13 +279,13 @@ class SamplingMpc(Mode):
             horizon, knots = self.cfg.horizon, self.cfg.knots
             at = torch.linspace(0, horizon - 1, knots)
             then = at + self.cfg.replan_every
-            later = _interpolate(then / (horizon - 1) * (knots - 1), knots)
-            lower, upper, spline, basis, later = (
+            later = interpolate(then / (horizon - 1) * (knots - 1), knots)
+            lower, upper, weights, basis, later = (
                 each.to(like) for each in (self.lower, self.upper, self.spline, self.basis, later)
             )
             guess = None if self.guess is None else self.guess.to(like.device)
             inside, at = int((then <= horizon - 1).sum()), at.to(like.device)
-            self._there[key] = Constants(lower, upper, spline, basis, later, inside, at, guess)
+            self._there[key] = Constants(lower, upper, weights, basis, later, inside, at, guess)
         return self._there[key]
 
     def _prior(self, like: Tensor, steps: Tensor, first: int = 0) -> Tensor:
@@ -383,17 +397,3 @@ class SamplingMpc(Mode):
         self.control_steps += n * horizon
         stages = total((total(terms) * sim.dt).reshape(n, horizon))  # in this order at any n
         return stages + total(self.cost.terminal_terms(states[:, -1], k + horizon))
-
-
-def _interpolate(at: Tensor, knots: int) -> Tensor:
-    """Rows of linear interpolation weights at positions `at` in knot units, (len(at), knots)."""
-    at = at.clamp(0, knots - 1)
-    low = at.floor().long().clamp(max=knots - 2)
-    w = (at - low)[:, None]
-    eye = torch.eye(knots, dtype=torch.float64)
-    return (1 - w) * eye[low] + w * eye[low + 1]
-
-
-def _spline(horizon: int, knots: int) -> Tensor:
-    """B of the plan u = B theta, (H, K): knot j sits at step j (H - 1) / (K - 1)."""
-    return _interpolate(torch.linspace(0, knots - 1, horizon, dtype=torch.float64), knots)

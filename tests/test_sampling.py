@@ -130,6 +130,26 @@ def test_a_planner_on_its_own_keeps_to_its_budget_and_gets_better_with_it(method
     assert costs[2] < costs[0]
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_guess_is_where_a_planner_begins(method):
+    """A solution given back is the first sample: one update more is no worse, and better than a first one."""
+    x, u, _ = situations(1)
+    before = mode(method=method, elites=3, noise=0.2).solve(x[0], u[0], 48 * 60)
+    again = mode(method=method, elites=3, noise=0.2, seed=8)
+    warm, cold = (again.solve(x[0], u[0], 1, guess=guess) for guess in (before.controls, None))
+    assert warm.cost <= before.cost * (1 + 1e-12) < cold.cost
+    assert warm.control_steps == cold.control_steps == 48
+    still = mode(method=method, elites=3, noise=0.0)
+    line = torch.linspace(-1, 1, 6, dtype=torch.float64)[:, None] * torch.tensor([1.0, -0.5]).double()
+    torch.testing.assert_close(still.solve(x[0], u[0], 1, guess=line).controls, line)
+    bent = torch.tensor([0.0, 1.0, 0.0, 0.0, 1.0, 0.0], dtype=torch.float64)[:, None].expand(6, 2)
+    knots = torch.linalg.pinv(still.spline) @ bent
+    torch.testing.assert_close(still.solve(x[0], u[0], 1, guess=bent).controls, still.spline @ knots)
+    for wrong in (line[:5], line * math.nan):
+        with pytest.raises(ValueError, match=r"guess: expected \(6, 2\) finite inputs, got shape \("):
+            still.solve(x[0], u[0], 1, guess=wrong)
+
+
 def test_the_plan_runs_open_loop_between_replans():
     mppi = mode(replan_every=3)
     x, u, k = situations(1)
