@@ -1,18 +1,22 @@
-"""The cartpole study in a tiny setting: what is written, and that a stopped study goes on."""
+"""The cartpole study in a tiny setting: what is written, and that a stopped study goes on; its reference."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
+import torch
 
 from hmc.cfg import load
 from hmc.sampling import METHODS
+from hmc.sim.cartpole import CartpoleSim
 from tools import cartpole, cartpole_study, study
 from tools.cartpole_figures import gap, reference
 
 TINY = (
-    *("horizons=[6, 8]", "seeds=2", "rollouts=60", "starts=1", "num_modes=[3, 5]", "angles=[3.14159]"),
+    *("horizons=[6, 8]", "compare=[8]", "seeds=2", "rollouts=60", "optima=1", "starts=1", "num_modes=[3, 5]"),
+    "angles=[3.14159, 1.5]",
     *("loop.steps=2", "loop.rollouts=10", "task.horizon=8", "task.angle=3.14159", "schedules.samples=16"),
     *("mppi.samples=10", "cem.samples=10", "ps.samples=10"),
 )
@@ -45,10 +49,42 @@ def test_costs_are_those_of_the_task(cfg, rows):
     for row in rows:
         assert math.isfinite(row.cost)
         if (row.job.part, row.job.num_modes) == ("solve", 5):
-            assert gap(rows, row) == pytest.approx((row.cost - reference(rows, row.job)) / row.job.horizon)
+            least = reference(rows, row.job).cost
+            assert gap(rows, row) == pytest.approx((row.cost - least) / row.job.horizon)
             assert gap(rows, row) > -1e-3
     again = cartpole_study.work(cfg, rows[0].job)
     assert (again.cost, again.control_steps) == (rows[0].cost, rows[0].control_steps)
+
+
+def test_modes_and_angles_are_compared_in_both_parts(cfg, rows):
+    for part in ("solve", "loop"):
+        mine = [row.job for row in rows if row.job.part == part and row.job.horizon == 8]
+        assert {job.num_modes for job in mine if job.planner == "schedules"} == {3, 5}
+        assert {job.planner for job in mine if job.angle == 1.5} >= set(cartpole_study.PLANNERS)
+    with pytest.raises(ValueError, match=r"compare = \[9\]: choose among the horizons 6, 8"):
+        replace(cfg, compare=(9,))
+
+
+def test_a_longer_horizon_is_no_worse_than_what_holds_the_shorter_one():
+    """What iLQR comes to at 40 steps, held up from there on, costs hardly more than it does."""
+    cfg = cartpole_study.StudyCfg(horizons=(40, 60), compare=(), iterations=30)
+    short, long = (cartpole_study.Job("solve", "ilqr", horizon, 0, 5, math.pi) for horizon in (40, 60))
+    before, after = cartpole_study.optimum(cfg, short), cartpole_study.optimum(cfg, long)
+    assert before.cost < 15
+    assert after.cost < before.cost + 0.1
+    assert after.controls.shape == (60, 1)
+
+
+def test_hold_keeps_the_pole_up():
+    sim = CartpoleSim(1)
+    x = torch.tensor([2 * math.pi + 0.15, 0.1, -0.2, 0.3], dtype=torch.float64)
+    inputs = cartpole_study.hold(sim, x, 200)
+    assert inputs.shape == (200, 1)
+    assert inputs.abs().max() <= 1
+    for u in inputs:
+        x = sim.advance(x[None], u[None])[0]
+    assert abs(float(x[0]) - 2 * math.pi) < 0.01
+    assert float(x[1:].abs().max()) < 0.3
 
 
 def test_a_stopped_study_goes_on(cfg, rows, tmp_path, monkeypatch, capsys):

@@ -46,7 +46,8 @@ def main(args: Args) -> int:
         return 1
     cartpole_figures.gaps(args.out / "gap.png", rows, cfg)
     job = Job("solve", "schedules", cfg.task.horizon, 0, cfg.task.num_modes, cfg.task.angle)
-    cartpole_figures.sequence(args.out / "sequence.png", search(cfg, job), optimum(cfg, job), cfg)
+    best = cartpole_figures.reference(rows, job)
+    cartpole_figures.sequence(args.out / "sequence.png", search(cfg, job), optimum(cfg, best.job), cfg)
     study.write(args.out / "results.csv", rows)
     console.print(cartpole_figures.table(rows, cfg))
     return 0

@@ -18,15 +18,16 @@ NAMES = {"schedules": "mode schedules (ours)", "mppi": "MPPI", "cem": "CEM", "ps
 COLORS = {"schedules": "#d1495b", "mppi": "#30638e", "cem": "#edae49", "ps": "#4c9f70"}
 
 
-def reference(rows: list[Row], like: Job) -> float:
+def reference(rows: list[Row], like: Job) -> Row:
     """The lowest of iLQR's local optima of a job's horizon and angle."""
     same = (like.horizon, like.angle)
-    return min(r.cost for r in rows if r.job.planner == "ilqr" and (r.job.horizon, r.job.angle) == same)
+    found = [r for r in rows if r.job.planner == "ilqr" and (r.job.horizon, r.job.angle) == same]
+    return min(found, key=lambda row: row.cost)
 
 
 def gap(rows: list[Row], row: Row) -> float:
     """(J - J_iLQR) / T, the paper's measure."""
-    return (row.cost - reference(rows, row.job)) / row.job.horizon
+    return (row.cost - reference(rows, row.job).cost) / row.job.horizon
 
 
 def of(rows: list[Row], **settings: object) -> list[Row]:
@@ -95,14 +96,25 @@ def table(rows: list[Row], cfg: StudyCfg) -> Table:
 
     for part, label in (("solve", "gap"), ("loop", "run")):
         for horizon in sorted(cfg.horizons):
-            found = [pick(rows, cfg, part, planner)[horizon] for planner in NAMES]
-            values = [[gap(rows, r) if part == "solve" else r.cost for r in each] for each in found]
+            picked = [pick(rows, cfg, part, planner)[horizon] for planner in NAMES]
+            values = [[gap(rows, r) if part == "solve" else r.cost for r in each] for each in picked]
             line(f"{label}, T = {horizon}", values)
-    solved = of(rows, part="solve", horizon=cfg.task.horizon)
-    for count in cfg.num_modes:
-        ours = of(solved, planner="schedules", num_modes=count, angle=cfg.task.angle)
-        line(f"gap, {count} modes", [[gap(rows, row) for row in ours]])
-    for angle in cfg.angles:
-        found = [of(solved, planner=each, angle=angle, num_modes=cfg.task.num_modes) for each in NAMES]
-        line(f"gap from {np.degrees(angle):.0f} deg", [[gap(rows, row) for row in each] for each in found])
+            limit = horizon * (cfg.rollouts if part == "solve" else cfg.loop.steps * cfg.loop.rollouts)
+            line(
+                f"share of the limit used, T = {horizon}",
+                [[r.control_steps / limit for r in each] for each in picked],
+            )
+    for part, label in (("solve", "gap"), ("loop", "run")):
+        for horizon in cfg.compare:
+            here = of(rows, part=part, horizon=horizon)
+
+            def cells(planner: str, count: int, angle: float, here: list[Row] = here) -> list[float]:
+                mine = of(here, planner=planner, num_modes=count, angle=angle)
+                return [gap(rows, row) if row.job.part == "solve" else row.cost for row in mine]
+
+            for count in cfg.num_modes:
+                line(f"{label}, T = {horizon}, {count} modes", [cells("schedules", count, cfg.task.angle)])
+            for angle in cfg.angles:
+                found = [cells(each, cfg.task.num_modes, angle) for each in NAMES]
+                line(f"{label}, T = {horizon}, from {np.degrees(angle):.0f} deg", found)
     return view

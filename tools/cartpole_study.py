@@ -6,9 +6,11 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch.func import jacfwd
 
 from hmc import Budget, Plan, Receding, Task, plan
 from hmc.ilqr import Optimum, ilqr
@@ -69,9 +71,11 @@ class StudyCfg:
         seeds: of each planner.
         rollouts: budget of one solution: this many times T control steps.
         optima: iLQR's runs, with a seed each; the best of all is the reference.
-        starts: random inputs that each of them begins from.
-        num_modes: numbers of modes to compare, at the task's horizon.
-        angles: start angles to compare, likewise [rad].
+        starts: random inputs that each of them begins from, beside what it came to at shorter horizons.
+        iterations: of iLQR from each, at most.
+        compare: horizons at which the following are compared.
+        num_modes: numbers of modes.
+        angles: start angles [rad].
         task: the cartpole.
         loop: receding-horizon control.
         schedules, mppi, cem, ps: the planners.
@@ -80,8 +84,10 @@ class StudyCfg:
     horizons: tuple[int, ...] = (20, 40, 70, 100, 150)
     seeds: int = 5
     rollouts: int = 1000
-    optima: int = 2
+    optima: int = 3
     starts: int = 1
+    iterations: int = 100
+    compare: tuple[int, ...] = (70, 100)
     num_modes: tuple[int, ...] = (3, 5, 9, 17)
     angles: tuple[float, ...] = (math.pi, math.pi / 2)
     task: CartpoleCfg = field(default_factory=CartpoleCfg)
@@ -90,6 +96,11 @@ class StudyCfg:
     mppi: SamplerCfg = field(default_factory=SamplerCfg)
     cem: SamplerCfg = field(default_factory=SamplerCfg)
     ps: SamplerCfg = field(default_factory=SamplerCfg)
+
+    def __post_init__(self) -> None:
+        if not set(self.compare) <= set(self.horizons):
+            known = ", ".join(map(str, self.horizons))
+            raise ValueError(f"compare = {list(self.compare)}: choose among the horizons {known}")
 
 
 @dataclass(frozen=True)
@@ -133,11 +144,19 @@ def jobs(cfg: StudyCfg) -> list[Job]:
         for planner in planners
         for seed in (range(cfg.optima) if planner == "ilqr" else seeds)
     ]
-    found += [Job("solve", "schedules", cfg.task.horizon, s, m, angle) for m in cfg.num_modes for s in seeds]
     found += [
-        Job("solve", planner, cfg.task.horizon, seed, modes, angle)
+        Job(part, "schedules", horizon, seed, count, angle)
+        for part in ("loop", "solve")
+        for horizon in cfg.compare
+        for count in cfg.num_modes
+        for seed in seeds
+    ]
+    found += [
+        Job(part, planner, horizon, seed, modes, angle)
+        for part, planners in (("loop", PLANNERS), ("solve", (*PLANNERS, "ilqr")))
+        for horizon in cfg.compare
         for angle in cfg.angles
-        for planner in (*PLANNERS, "ilqr")
+        for planner in planners
         for seed in (range(cfg.optima) if planner == "ilqr" else seeds)
     ]
     return list(dict.fromkeys(found))
@@ -175,14 +194,40 @@ def search(cfg: StudyCfg, job: Job) -> Plan:
 
 
 def optimum(cfg: StudyCfg, job: Job) -> Optimum:
-    """The best of iLQR's local optima from random inputs."""
+    """The best of iLQR's local optima: from random inputs, and from what it comes to at the next shorter
+    horizon, followed by no input or by what holds the pole up."""
     task, x = task_of(cfg, job)
     sim = task.make_sim(1)
     assert isinstance(sim, CartpoleSim)
     generator = torch.Generator().manual_seed(job.seed)
-    first = torch.empty(cfg.starts, job.horizon, 1, dtype=torch.float64).uniform_(-1, 1, generator=generator)
-    found = [ilqr(sim.advance, task.cost, sim.dt, x, begin, -ONE, ONE) for begin in first]
+    random = torch.empty(cfg.starts, job.horizon, 1, dtype=torch.float64).uniform_(-1, 1, generator=generator)
+    begins = list(random)
+    if shorter := [each for each in cfg.horizons if each < job.horizon]:
+        before = optimum(cfg, replace(job, horizon=max(shorter)))
+        steps = job.horizon - max(shorter)
+        ends = torch.zeros(steps, 1, dtype=torch.float64), hold(sim, before.states[-1], steps)
+        begins += [torch.cat([before.controls, end]) for end in ends]
+    descend = partial(
+        ilqr, sim.advance, task.cost, sim.dt, x, lower=-ONE, upper=ONE, iterations=cfg.iterations
+    )
+    found = [descend(begin) for begin in begins]
     return min(found, key=lambda each: each.cost)
+
+
+def hold(sim: CartpoleSim, x: Tensor, steps: int) -> Tensor:
+    """Inputs (steps, 1) from state x (4,) on by which LQR about upright holds the pole, within the limits."""
+    a, b = jacfwd(lambda x, u: sim.advance(x[None], u[None])[0], (0, 1))(torch.zeros_like(x), 0 * ONE)
+    q = torch.tensor([4.0, 0.1, 0.1, 0.1], dtype=torch.float64).diag()
+    value = q
+    for _ in range(1000):
+        gain = torch.linalg.solve(1 + b.T @ value @ b, b.T @ value @ a)
+        value = q + a.T @ value @ (a - b @ gain)
+    inputs = []
+    for _ in range(steps):
+        upright = torch.cat([torch.atan2(x[:1].sin(), x[:1].cos()), x[1:]])
+        inputs.append((-gain @ upright).clamp(-1, 1))
+        x = sim.advance(x[None], inputs[-1][None])[0]
+    return torch.stack(inputs)
 
 
 def solve(cfg: StudyCfg, job: Job) -> tuple[float, int]:
