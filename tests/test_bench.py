@@ -27,18 +27,14 @@ from train.runner import read_checkpoint
 
 SMALL = {
     "engine": (
-        Engine(threads=1, worlds=4, steps=2, horizon=3, repeats=2),
+        Engine(threads=1, worlds=4, steps=2, repeats=2),
         {
-            "open_loop_efficiency",
-            "open_loop_steps_per_s",
-            "open_loop_bare_steps_per_s",
-            "open_loop_us_per_step",
-            "policy_efficiency",
-            "policy_steps_per_s",
-            "evaluator_efficiency",
-            "evaluator_open_loop_efficiency",
-            "evaluator_few_efficiency",
-            "evaluator_few_open_loop_efficiency",
+            "sim_open_loop_efficiency",
+            "sim_open_loop_steps_per_s",
+            "sim_open_loop_bare_steps_per_s",
+            "sim_open_loop_us_per_step",
+            "sim_policy_efficiency",
+            "sim_policy_steps_per_s",
         },
     ),
     "train": (
@@ -51,7 +47,7 @@ SMALL = {
         {"train_steps_per_s", "collect_share", "physics_share", "learn_share"},
     ),
     "planner": (
-        Planner(threads=1, horizon=6, cartpole_horizon=10, samples=16, ticks=1, repeats=1),
+        Planner(threads=1, horizon=6, cartpole_horizon=10, samples=16, few=4, ticks=1, repeats=1),
         {"us_per_candidate", "cartpole_exact_ms", "cartpole_converged_ms"},
     ),
     "gpu": (
@@ -110,6 +106,8 @@ def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         )
         args = Planner(**{**vars(args), "set": names + small})
         expected = expected | {"shared_fraction", "pruned_fraction", "mppi_overhead"}
+        expected = expected | {"policy_efficiency", "open_loop_efficiency"}
+        expected = expected | {"policy_few_efficiency", "open_loop_few_efficiency"}
         expected = expected | {"go2_tick_ms_p50", "go2_tick_ms_p99", "go2_control_steps_fraction"}
         expected = expected | {"ensemble_3_fraction", "ensemble_5_fraction"}
 

@@ -1,8 +1,9 @@
 """How fast it is: `python tools/bench.py engine|train|planner|wire|growth|gpu [--json FILE]`.
 
 Ratios are taken between two ways of doing the same work that take turns within one run, so that they mean
-something on a busy machine too; rates a second do only on an idle one. What is compared is checked to have
-come to the same states.
+something on a busy machine too; rates a second do only on an idle one. Where our work is compared with the
+bare engine's (`engine`, and in `planner` the efficiencies and `mppi_overhead`), both must have come to the
+same states.
 """
 
 from __future__ import annotations

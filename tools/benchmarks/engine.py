@@ -1,4 +1,4 @@
-"""Our simulator, policy mode and evaluator against the bare engine on the same work."""
+"""Our simulator, policy mode and evaluator, against the bare engine on the same work."""
 
 from __future__ import annotations
 
@@ -43,7 +43,6 @@ class Engine(Common):
     Attributes:
         worlds: stepped together.
         steps: control steps of a repeat.
-        horizon: of the search of all of Omega, control steps.
         repeats: of each side.
         policy: file of the policy mode; default: the handstand that comes with the package.
         clock: wall, or cpu: time that all threads spent together, for one thread on a busy machine.
@@ -51,7 +50,6 @@ class Engine(Common):
 
     worlds: int = 256
     steps: int = 20
-    horizon: int = 50
     repeats: int = 15
     policy: Path | None = None
     clock: Literal["wall", "cpu"] = "wall"
@@ -117,7 +115,7 @@ def same(ours: np.ndarray, bare: np.ndarray, what: str) -> None:
 
 @torch.no_grad()
 def engine(args: Engine) -> Figures:
-    """Open loop, policy mode and evaluator against the bare engine."""
+    """Given targets, and a policy's, through the simulator, against the bare engine."""
     figures, model, threads = Figures(), load_model(), args.threads
     sim, bare = (
         MujocoSim(model, args.worlds, substeps=SUBSTEPS, threads=threads),
@@ -143,7 +141,7 @@ def engine(args: Engine) -> Figures:
         open_loop, lambda: bare.replay(rows.numpy(), targets.numpy()), args.repeats, args.clock
     )
     same(sim.save().numpy(), bare.batch.state, "open loop")
-    add_ratio(figures, "open_loop", times, physics_steps, f"{args.worlds} worlds, given targets")
+    add_ratio(figures, "sim_open_loop", times, physics_steps, f"{args.worlds} worlds, given targets")
 
     with tempfile.TemporaryDirectory() as folder:
         path = args.policy or policy_path("handstand")
@@ -152,16 +150,6 @@ def engine(args: Engine) -> Figures:
         policy = Policy(path, name="hand", threads=threads)
         words = "random policy" if path.name == "random.onnx" else path.name
         _policy_mode(figures, args, sim, bare, policy, words)
-        policies = [Policy(path, name=name, threads=threads) for name in ("hand", "other", "third")]
-        _evaluator(figures, args, "evaluator", policies, args.horizon, words)
-        _evaluator(figures, args, "evaluator_few", policies[:2], args.steps, words)
-    pose = HANDSTAND.pose.double()
-    played = [
-        Motion(mode.name, pose + 0.1 * torch.randn(args.horizon, 12, dtype=torch.float64))
-        for mode in policies
-    ]
-    _evaluator(figures, args, "evaluator_open_loop", played, args.horizon, "motions")
-    _evaluator(figures, args, "evaluator_few_open_loop", played[:2], args.steps, "motions")
     return figures
 
 
@@ -190,19 +178,55 @@ def _policy_mode(
     targets = applied.numpy().copy()
     times = take_turns(closed_loop, lambda: bare.replay(rows.numpy(), targets), args.repeats, args.clock)
     same(sim.save().numpy(), bare.batch.state, "policy mode")
-    add_ratio(figures, "policy", times, args.worlds * args.steps * SUBSTEPS, f"{args.worlds} worlds, {words}")
+    made = args.worlds * args.steps * SUBSTEPS
+    add_ratio(figures, "sim_policy", times, made, f"{args.worlds} worlds, {words}")
+
+
+@dataclass(frozen=True)
+class Turns:
+    """How evaluator and bare engine take turns: threads of both, repeats, and what the clock counts."""
+
+    threads: int
+    repeats: int
+    clock: str = "wall"
+
+
+@torch.no_grad()
+def evaluator(figures: Figures, turns: Turns, path: Path, horizon: int, few: int) -> None:
+    """The bare engine's efficiency inside the evaluator: `policy_efficiency` and `open_loop_efficiency`.
+
+    Args:
+        figures: get these, and the same of few worlds.
+        turns: of the two sides.
+        path: of the policy that all three modes are.
+        horizon: of all of Omega, control steps.
+        few: horizon with two modes, so that the worlds are few.
+    """
+    policies = [Policy(path, name=name, threads=turns.threads) for name in ("hand", "other", "third")]
+    pose = HANDSTAND.pose.double()
+    played = [
+        Motion(mode.name, pose + 0.1 * torch.randn(max(horizon, few), 12, dtype=torch.float64))
+        for mode in policies
+    ]
+    kinds: tuple[tuple[str, Sequence[Mode], str], ...] = (
+        ("policy", policies, path.name),
+        ("open_loop", played, "motions"),
+    )
+    for name, modes, words in kinds:
+        _evaluator(figures, turns, name, modes, horizon, words)
+        _evaluator(figures, turns, f"{name}_few", modes[:2], few, words)
 
 
 def _evaluator(
-    figures: Figures, args: Engine, name: str, modes: Sequence[Mode], horizon: int, words: str
+    figures: Figures, turns: Turns, name: str, modes: Sequence[Mode], horizon: int, words: str
 ) -> None:
     """The planner's rollouts of all single switches, costs included, against the steps that they come to."""
     space = SwitchSpace(len(modes), horizon)
     others = torch.arange(len(space) // len(modes), len(space))  # into the mode that runs nothing changes
     schedules = space.stitch(Schedule.constant(0, horizon), others)
     model, many = load_model(), len(others)
-    sim = MujocoSim(model, many, substeps=SUBSTEPS, threads=args.threads)
-    bare = Bare(model, many, args.threads)
+    sim = MujocoSim(model, many, substeps=SUBSTEPS, threads=turns.threads)
+    bare = Bare(model, many, turns.threads)
     cost = stance_cost(CostCfg(), lambda k: k >= 0)
     task = Task("hold", ModeSet(modes), cost, horizon, lambda n: sim)
     start = make_start(task, sim, HANDSTAND.state(), HANDSTAND.pose.double(), None, None, 0, None)
@@ -231,9 +255,11 @@ def _evaluator(
             bare.batch.step(ids, nstep=SUBSTEPS)
         yield
 
-    times = take_turns(rollouts, whole, max(1, args.repeats // 3), args.clock)
+    times = take_turns(rollouts, whole, turns.repeats, turns.clock)
     last = steps[-1][0]
     same(sim.save().numpy()[last], bare.batch.state[last], name)
     made = sum(len(ids) for ids, _, _ in steps) * SUBSTEPS
-    what = f"{many} schedules with costs, T {horizon}, M {len(modes)}, {words}"
+    what = (
+        f"the engine inside the evaluator: {many} schedules with costs, T {horizon}, M {len(modes)}, {words}"
+    )
     add_ratio(figures, name, times, made, what)

@@ -6,6 +6,7 @@ import statistics
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from hmc.sim.ids import Ids, count
 from hmc.sim.mujoco import MujocoSim
 from hmc.tasks.cartpole import CartpoleCfg, cartpole, initial_state
 from tools import closed_loop
+from tools.benchmarks import engine
 from tools.benchmarks.figures import Common, Figures
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,7 +39,9 @@ class Planner(Common):
         samples: switches a batch of the cartpole's converged plan.
         max_samples: that they may double to.
         seeds: of that plan; how many draws it takes is chance.
+        few: horizon of the evaluator in few worlds.
         repeats: of what is fast.
+        clock: of the engine inside the evaluator: wall, or cpu, as for `Engine`.
         ticks: of the Go2's closed loop, from shortly before the command to flip on.
         set: overrides of cfg/flip.toml.
     """
@@ -47,14 +51,17 @@ class Planner(Common):
     samples: int = 4096
     max_samples: int = 16384
     seeds: int = 3
+    few: int = 20
     repeats: int = 5
+    clock: Literal["wall", "cpu"] = "wall"
     ticks: int = 20
     set: tuple[str, ...] = ()
 
 
 @torch.no_grad()
 def planner(args: Planner) -> Figures:
-    """Overhead a candidate, exact and converged plans of the cartpole, and the Go2's planning."""
+    """Overhead a candidate, exact and converged plans of the cartpole, the engine's share, and the Go2's
+    planning."""
     figures = Figures()
     modes = ModeSet([ConstantInput(str(i), float(i)) for i in range(3)])
     zero = Cost({"nothing": lambda x, u, u_prev, k: x[:, 0]}, nonnegative=True)
@@ -74,6 +81,8 @@ def planner(args: Planner) -> Figures:
         policy_path(*names).is_file()
         for names in (("footstand", run.task.foot), ("handstand", run.task.hand))
     ):
+        turns = engine.Turns(args.threads, args.repeats, args.clock)
+        engine.evaluator(figures, turns, policy_path("handstand", run.task.hand), args.horizon, args.few)
         _omega(figures, args, run)
         _replan(figures, args, run)
         _ticks(figures, args, run)
@@ -166,13 +175,15 @@ def _each_alone(task: Task, x: Tensor, u: Tensor, horizon: int, schedules: int) 
 
 
 class _Recorded(MujocoSim):
-    """Keeps the inputs of its last rollout, (n, steps, nu)."""
+    """Keeps the inputs of its last rollout, (n, steps, nu), and the states that they led to, (n, nx)."""
 
     given: Tensor
+    ends: Tensor
 
     def rollout(self, controls: Tensor, ids: Tensor) -> Tensor:
-        self.given = controls
-        return super().rollout(controls, ids)
+        self.given, states = controls, super().rollout(controls, ids)
+        self.ends = states[:, -1]
+        return states
 
 
 def _replan(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
@@ -191,8 +202,10 @@ def _replan(figures: Figures, args: Planner, cfg: closed_loop.RunCfg) -> None:
         bare.reset(x.expand(30, -1), u.expand(30, -1))
         held = sim.given.repeat_interleave(SUBSTEPS, 1).numpy()
         began = time.perf_counter()
-        bare.batch.rollout(held.shape[1], held, record=("qpos", "qvel"))
+        found = bare.batch.rollout(held.shape[1], held, record=("qpos", "qvel"))
         took[1].append(time.perf_counter() - began)
+        ends = np.concatenate([found["qpos"][:, -1], found["qvel"][:, -1]], 1)
+        engine.same(sim.ends.numpy(), ends, "an MPPI update")
     figures.add(
         "mppi_overhead",
         statistics.median(took[0]) / statistics.median(took[1]),
