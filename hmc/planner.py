@@ -44,6 +44,8 @@ class Plan:
         switches: accepted switches, in order; stitched onto `incumbent` they give `schedule`.
         costs: the incumbent's cost, then the cost after each accepted switch, or pair of switches (never
             rising, Theorem 1).
+        steps: why each of them: the switches accepted at once, and the cost's terms after them; one entry for
+            each cost after the first.
         seen: switches of `schedule` that were evaluated and do not improve it.
         space_size: Z, how many there are.
         draws: switches evaluated in the whole search, repeats included.
@@ -69,6 +71,7 @@ class Plan:
     incumbent_terms: Mapping[str, float]
     switches: tuple[Switch, ...]
     costs: tuple[float, ...]
+    steps: tuple[tuple[tuple[Switch, ...], Mapping[str, float]], ...]
     seen: int
     space_size: int
     draws: int
@@ -338,6 +341,7 @@ def _plan(search: Search) -> Plan:
         incumbent_terms=best.incumbent_terms,
         switches=best.switches,
         costs=best.costs,
+        steps=best.steps,
         seen=best.seen,
         space_size=len(search.space),
         draws=search.meter.draws,

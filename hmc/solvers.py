@@ -39,6 +39,7 @@ class Standing:
         terms: its cost, term by term, once it is known.
         costs: the incumbent's cost once it is known, then the cost after each accepted switch or pair.
         switches: accepted switches.
+        steps: what was accepted at once, and the cost's terms after it.
         seen: how many switches of `schedule` were evaluated and do not improve it.
     """
 
@@ -48,6 +49,7 @@ class Standing:
     terms: Mapping[str, float]
     costs: tuple[float, ...] = ()
     switches: tuple[Switch, ...] = ()
+    steps: tuple[tuple[tuple[Switch, ...], Mapping[str, float]], ...] = ()
     seen: int = 0
 
 
@@ -175,13 +177,15 @@ class Search:
         """
         if cost < self.bound or (equal and self.ahead is not None and cost == self.bound):
             best, schedule = self.best, self._stitched(switches)
+            terms = self.evaluator.terms(schedule)
             self.ahead = Standing(
                 best.incumbent,
                 best.incumbent_terms,
                 schedule,
-                self.evaluator.terms(schedule),
+                terms,
                 (*best.costs, cost),
                 (*best.switches, *switches),
+                (*best.steps, (tuple(switches), terms)),
             )
 
     def _pairs(self, ahead: int) -> Pairs:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from hmc import Evaluator, Schedule, Switch, make_start
-from tests.toy import slow_cost, toy_task
-from tools.landscape import draw, landscape, parse, read
+from hmc import Budget, Evaluator, Rules, Schedule, Switch, make_start, plan
+from hmc.tasks.cartpole import CartpoleCfg, cartpole
+from tests.toy import Bad, Damp, Push, slow_cost, toy_task
+from tools import landscape as shows
+from tools.landscape import Args, Landscape, draw, landscape, main, of_log, of_plan, parse, read, reason
 
 NAMES = ("foot", "jump", "hand")
 
@@ -31,9 +36,97 @@ def test_every_switch_is_at_its_place(tmp_path):
                     switched = schedule.stitch(Switch(mode, start, duration))
                     assert cost == pytest.approx(slow_cost(task, switched, [0.4, -0.2]))
     assert slow_cost(task, found.best, [0.4, -0.2]) == pytest.approx(np.nanmin(found.costs))
-    assert sum(found.terms[0].values()) == pytest.approx(found.cost)
+    assert found.switch is not None
+    assert found.best == schedule.stitch(found.switch)
+    assert [sum(terms.values()) for terms in found.terms] == pytest.approx(
+        [found.cost, np.nanmin(found.costs)]
+    )
+    assert not found.barred.any()
     draw(tmp_path / "picture.png", found, "toy")
     assert (tmp_path / "picture.png").stat().st_size > 5000
+
+
+def shown(found: Landscape, path: Path, monkeypatch: pytest.MonkeyPatch) -> Figure:
+    """The figure that is drawn."""
+    figures = []
+    monkeypatch.setattr(shows, "save", lambda figure, _: figures.append(figure))
+    draw(path, found, "toy")
+    return figures[0]
+
+
+def test_the_mark_is_on_the_best_switch_by_its_own_duration(tmp_path, monkeypatch):
+    task = toy_task(4)
+    sim = task.make_sim(16)
+    begin = Evaluator(task, sim, make_start(task, sim, [0.4, -0.2]))
+    found = landscape(task, begin, Schedule((0, 0, 1, 1), task.modes.names))
+    assert found.switch is not None
+    panels = shown(found, tmp_path, monkeypatch).axes[:3]
+    for mode, axis in enumerate(panels):
+        marks = [line.get_xydata().tolist() for line in axis.lines]
+        mine = [[[found.switch.start, found.switch.duration]]] if mode == found.switch.mode else []
+        assert marks == mine
+        left, right, low, high = axis.images[0].get_extent()
+        assert (left, right, low, high) == (-0.5, 3.5, 0.5, 4.5), "durations of 1 to T"
+
+
+def test_nothing_is_marked_where_nothing_improves(tmp_path, monkeypatch):
+    task = toy_task(4)
+    best = plan(task, [0.4, -0.2], solver="exhaustive")
+    assert best.locally_optimal
+    sim = task.make_sim(16)
+    found = landscape(task, Evaluator(task, sim, make_start(task, sim, [0.4, -0.2])), best.schedule)
+    assert (found.switch, found.best) == (None, best.schedule)
+    assert found.terms[0] == found.terms[1]
+    assert not any(axis.lines for axis in shown(found, tmp_path, monkeypatch).axes)
+
+
+def test_barred_and_diverged_switches_are_told_apart(tmp_path, monkeypatch):
+    """A mode that may not come second, and one that ends in NaN."""
+    task = toy_task(4, [Push(1.0), Damp(), Bad(0)])
+    task = replace(task, rules=Rules(forbidden=[("push1", "damp")]))
+    sim = task.make_sim(16)
+    begin = Evaluator(task, sim, make_start(task, sim, [0.4, -0.2], mode=0))
+    found = landscape(task, begin, Schedule((0, 0, 0, 0), task.modes.names))
+    legal = ~np.isnan(found.costs[0])
+    assert found.barred[1][legal].all()
+    assert not found.barred[[0, 2]].any()
+    assert np.isinf(found.costs[2][legal]).all()
+    panels = shown(found, tmp_path, monkeypatch).axes[:3]
+    kinds = [np.unique(np.ma.compressed(axis.images[1].get_array())).tolist() for axis in panels]
+    assert kinds == [[], [0.0], [1.0]]
+    legend = panels[2].get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "against the rules",
+        "diverged, or not to be entered",
+    ]
+
+
+def test_a_plan_step_by_step(tmp_path, capsys):
+    """The cartpole's: each accepted step with the terms that fell, and the landscape after some of them."""
+    small = ("horizon=12", "num_modes=3", "angle=1.0")
+    args = Args(
+        task="cartpole", step=1, out=tmp_path / "new" / "c.png", worlds=64, control_steps=4000, set=small
+    )
+    main(args)
+    assert (tmp_path / "new" / "c.png").stat().st_size > 5000
+    said = capsys.readouterr().out
+    task = cartpole(CartpoleCfg(horizon=12, num_modes=3, angle=1.0))
+    budget = Budget(control_steps=4000)
+    found = plan(task, [1.0, 0, 0, 0], schedule=[1] * 12, budget=budget)
+    assert of_plan(found, 0) == found.incumbent
+    assert of_plan(found, len(found.steps)) == found.schedule
+    assert str(of_plan(found, 1)) in said
+    ((_, after), *_) = found.steps
+    assert reason(found.incumbent_terms, after) in " ".join(said.split())
+    with pytest.raises(SystemExit):
+        main(replace(args, step=99))
+    assert f"the plan has 0 to {len(found.steps)} accepted steps, got --step 99" in capsys.readouterr().err
+
+
+def test_the_largest_fall_comes_first():
+    before, after = {"a": 1.0, "b": 2.0, "c": 0.0}, {"a": 1.5, "b": 0.5, "c": -0.25}
+    assert reason(before, after) == "b -1.5, c -0.25, a +0.5"
 
 
 def test_a_compact_line_is_read_back():
@@ -44,10 +137,30 @@ def test_a_compact_line_is_read_back():
 def test_steps_that_cannot_be_shown(tmp_path):
     log = tmp_path / "seed_0.json"
     steps = [{"mode": mode, "u": [0.0]} for mode in ("foot", "jump", "hand", "hand")]
-    log.write_text(json.dumps({"steps": steps}))
+    log.write_text(json.dumps({"seed": 7, "steps": steps}))
     assert read(log, 3)["before"]["mode"] == "hand"
+    assert read(log, 3)["seed"] == 7, "of the jump's noise"
     with pytest.raises(ValueError, match="has steps 0 to 3, got --step 4"):
         read(log, 4)
     for step in (1, 2):
         with pytest.raises(ValueError, match=f"step {step} is in the jump"):
             read(log, step)
+
+
+def test_the_noise_is_that_of_the_run(tmp_path, monkeypatch):
+    """A log's search is rolled out under the log's own seed."""
+    log, seeds = tmp_path / "seed_7.json", []
+    entry = {"mode": "foot", "u": [0.0], "x": [0.4, -0.2], "schedule": "push1 x6"}
+    log.write_text(json.dumps({"seed": 7, "steps": [{**entry, "mode": "damp"}] * 2}))
+
+    def made(cfg, seed):
+        seeds.append(seed)
+        return toy_task(6)
+
+    monkeypatch.setattr(shows, "flip_task", made)
+    task, start, schedule = of_log(Args(log, step=1))
+    assert seeds == [7]
+    assert start.mode is not None
+    assert (task.modes.names[start.mode], start.k, len(schedule)) == ("damp", 1, 6)
+    with pytest.raises(ValueError, match=r"give seed_\*\.json"):
+        of_log(Args())

@@ -54,6 +54,13 @@ def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, or
     for switch in result.switches:
         stitched = stitched.stitch(switch)
     assert stitched == result.schedule
+    step = result.incumbent
+    for (switches, terms), cost in zip(result.steps, result.costs[1:], strict=True):
+        for switch in switches:
+            step = step.stitch(switch)
+        assert slow_cost(task, step, x) == cost
+        assert sum(terms.values()) == pytest.approx(cost, rel=1e-12)
+    assert [switch for switches, _ in result.steps for switch in switches] == list(result.switches)
     accepted = len(result.costs) - 1
     assert accepted <= len(result.switches) <= (2 if pairs or moves else 1) * accepted
     assert all(b < a for a, b in pairwise(result.costs))

@@ -1,16 +1,18 @@
-"""See a search: what every switch would cost at one step of a run.
+"""See a search: what every switch would cost at one step of a run, or of a plan, and why the best is taken.
 
 `python tools/landscape.py out/flip/seed_0.json --step 60` rolls all of Omega out from that step's state and
-plan, draws the cost over (start, duration) for each mode, and prints which terms the best switch lowers.
+plan; `python tools/landscape.py --task cartpole --step 2` does so around a plan's schedule after two accepted
+steps. Either draws the cost over (start, duration) for each mode, and says which terms the best one lowers.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -19,14 +21,19 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 import tyro  # noqa: E402
+from matplotlib.colors import ListedColormap  # noqa: E402
+from matplotlib.patches import Patch  # noqa: E402
 from rich.console import Console  # noqa: E402
 
-from hmc import Evaluator, Schedule, SwitchSpace, Task, make_start  # noqa: E402
-from hmc.cfg import load  # noqa: E402
+from hmc import Budget, Evaluator, Plan, Schedule, Start, Switch, SwitchSpace, Task, make_start, plan  # noqa: E402
+from hmc.cfg import load, override  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
+from hmc.tasks.cartpole import CartpoleCfg, cartpole, initial_state  # noqa: E402
 from tools.closed_loop import RunCfg  # noqa: E402
 from tools.figures import save  # noqa: E402
+
+BARRED, DIVERGED = "#222222", "#e0c341"
 
 
 @dataclass(frozen=True)
@@ -34,17 +41,22 @@ class Args:
     """Command line.
 
     Attributes:
-        log: seed_*.json of tools/flip.py.
-        step: control step whose search is shown; not one in the jump, whose memory is not in the log.
-        out: picture to write; default: beside the log.
+        log: seed_*.json of tools/flip.py, where the task is the flip.
+        task: flip, or cartpole, whose plan is made here.
+        step: of the flip, the control step whose search is shown; not one in the jump, whose memory is not in
+            the log. Of a plan, how many accepted steps are in the schedule that is shown.
+        out: picture to write; default: beside the log, or in out.
         worlds: rolled out together.
-        set: overrides of cfg/flip.toml, as the run had them.
+        control_steps: budget of the cartpole's plan.
+        set: overrides of cfg/flip.toml, as the run had them, or of the cartpole's settings.
     """
 
-    log: tyro.conf.Positional[Path]
-    step: int = 60
+    log: tyro.conf.Positional[Path | None] = None
+    task: Literal["flip", "cartpole"] = "flip"
+    step: int = 0
     out: Path | None = None
     worlds: int = 512
+    control_steps: int = 100_000
     set: tuple[str, ...] = ()
 
 
@@ -55,61 +67,92 @@ class Landscape:
     Attributes:
         schedule: that is switched.
         cost: its own.
-        costs: of each mode, by start and duration - 1, (M, T, T); NaN beyond the horizon.
-        best: schedule of lowest cost.
-        terms: before and after the best switch, term by term.
+        costs: of each mode, by start and duration - 1, (M, T, T); NaN beyond the horizon, inf where the
+            rollout diverged or a rule bars it.
+        barred: where the rules do not allow the schedule, whatever its states, (M, T, T).
+        switch: the best one; None where none lowers the cost.
+        terms: before and after it, term by term.
     """
 
     schedule: Schedule
     cost: float
     costs: np.ndarray
-    best: Schedule
+    barred: np.ndarray
+    switch: Switch | None
     terms: tuple[dict[str, float], dict[str, float]]
 
+    @property
+    def best(self) -> Schedule:
+        """The schedule with the best switch, if there is one."""
+        return self.schedule if self.switch is None else self.schedule.stitch(self.switch)
 
-def landscape(task: Task, evaluator: Evaluator, schedule: Schedule) -> Landscape:
-    """Roll out all of Omega."""
+
+def landscape(task: Task, evaluator: Evaluator, schedule: Schedule, tolerance: float = 1e-6) -> Landscape:
+    """Roll out all of Omega; a switch counts if it lowers the cost by more than this share, as in `plan`."""
     space = SwitchSpace(len(task.modes), task.horizon)
     cost = evaluator.follow(schedule)
     indices = torch.arange(len(space))
-    found = evaluator.costs(space.stitch(schedule, indices))
+    switched = space.stitch(schedule, indices)
+    found = evaluator.costs(switched)
     mode, start, duration = (part.numpy() for part in space.split(indices))
     costs = np.full((len(task.modes), task.horizon, task.horizon), np.nan)
     costs[mode, start, duration - 1] = found.numpy()
-    best = schedule.stitch(space[int(found.argmin())])
-    return Landscape(schedule, cost, costs, best, (evaluator.terms(schedule), evaluator.terms(best)))
+    barred = np.zeros(costs.shape, dtype=bool)
+    if task.rules is not None:
+        of = evaluator.start
+        barred[mode, start, duration - 1] = task.rules.broken(task.modes, switched, of.mode, of.ran).numpy()
+    lowest = int(found.argmin())
+    better = float(found[lowest]) < (cost - tolerance * abs(cost) if np.isfinite(cost) else cost)
+    switch = space[lowest] if better else None
+    after = schedule if switch is None else schedule.stitch(switch)
+    return Landscape(
+        schedule, cost, costs, barred, switch, (evaluator.terms(schedule), evaluator.terms(after))
+    )
 
 
 def draw(path: Path, found: Landscape, title: str) -> None:
-    """A panel a mode; the colour is the cost over that of the schedule as it is."""
+    """A panel a mode; the colour is the cost over that of the schedule as it is, a circle the best switch."""
     names = found.schedule.names or tuple(map(str, range(len(found.costs))))
-    change = found.costs - found.cost
-    reach = np.nanquantile(np.abs(change[np.isfinite(change)]), 0.9) or 1.0
-    figure, axes = plt.subplots(
-        1, len(names), figsize=(4 * len(names), 3.8), constrained_layout=True, sharey=True
-    )
-    for axis, name, values in zip(np.atleast_1d(axes), names, change, strict=True):
+    horizon = len(found.schedule)
+    change = found.costs - found.cost if np.isfinite(found.cost) else found.costs
+    finite = np.abs(change[np.isfinite(change)])
+    reach = (np.quantile(finite, 0.9) if len(finite) else 0.0) or 1.0
+    figure, axes = plt.subplots(1, len(names), figsize=(4 * len(names), 4.1), constrained_layout=True,
+                                sharey=True, squeeze=False)  # fmt: skip
+    place = {"origin": "lower", "extent": (-0.5, horizon - 0.5, 0.5, horizon + 0.5)}
+    for mode, (axis, name, values) in enumerate(zip(axes[0], names, change, strict=True)):
         image = axis.imshow(
-            np.where(np.isinf(values), reach, values).T,
-            origin="lower",
-            cmap="RdBu_r",
-            vmin=-reach,
-            vmax=reach,
+            np.where(np.isinf(values), np.nan, values).T, cmap="RdBu_r", vmin=-reach, vmax=reach, **place
         )
-        if np.nanmin(values) == np.nanmin(change):
-            start, duration = np.unravel_index(np.nanargmin(values), values.shape)
-            axis.plot(start, duration, marker="o", markersize=9, markerfacecolor="none", color="black")
+        endless = np.where(found.barred[mode], 0.0, np.where(np.isinf(values), 1.0, np.nan))
+        axis.imshow(endless.T, cmap=ListedColormap([BARRED, DIVERGED]), vmin=0, vmax=1, **place)
+        if found.switch is not None and found.switch.mode == mode:
+            at = found.switch.start, found.switch.duration
+            axis.plot(*at, marker="o", markersize=9, markerfacecolor="none", color="black")
         axis.set_title(f"switch to {name}", fontsize=10)
         axis.set_xlabel("start [control steps]")
-    np.atleast_1d(axes)[0].set_ylabel("duration [control steps]")
-    figure.colorbar(image, ax=axes, label="change of cost")
+    axes[0][0].set_ylabel("duration [control steps]")
+    figure.colorbar(image, ax=axes, label="change of cost; beyond the scale as its end")
+    endless = np.isinf(change) & ~found.barred
+    kinds = (BARRED, "against the rules", found.barred), (DIVERGED, "diverged, or not to be entered", endless)
+    handles = [Patch(color=color, label=label) for color, label, where in kinds if where.any()]
+    if handles:
+        axes[0][-1].legend(handles=handles, loc="upper right", fontsize=8)
     figure.suptitle(title, fontsize=10)
     save(figure, path)
 
 
+def reason(before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    """Why a switch: how much each term changed, the largest fall first."""
+    change = {name: after[name] - before[name] for name in before}
+    ordered = sorted(change.items(), key=lambda each: each[1])
+    return ", ".join(f"{name} {value:+.4g}" for name, value in ordered)
+
+
 def read(path: Path, step: int) -> dict[str, Any]:
     """A step's record."""
-    steps: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["steps"]
+    log = json.loads(path.read_text(encoding="utf-8"))
+    steps: list[dict[str, Any]] = log["steps"]
     if not 0 <= step < len(steps):
         raise ValueError(f"{path} has steps 0 to {len(steps) - 1}, got --step {step}")
     entry = steps[step]
@@ -117,7 +160,7 @@ def read(path: Path, step: int) -> dict[str, Any]:
         raise ValueError(
             f"{path}: step {step} is in the jump, whose memory is not in the log: take another one"
         )
-    return {**entry, "before": steps[max(0, step - 1)]}
+    return {**entry, "before": steps[max(0, step - 1)], "seed": log["seed"]}
 
 
 def parse(line: str, names: tuple[str, ...]) -> Schedule:
@@ -126,28 +169,69 @@ def parse(line: str, names: tuple[str, ...]) -> Schedule:
     return Schedule(tuple(names.index(name) for name, count in modes for _ in range(int(count))), names)
 
 
+def of_log(args: Args) -> tuple[Task, Start, Schedule]:
+    """A flip's step: the task with the run's own noise, the state, and the plan that came of it."""
+    if args.log is None:
+        raise ValueError("the flip's search is read from a log: give seed_*.json of tools/flip.py")
+    entry = read(args.log, args.step)
+    task = flip_task(load(ROOT / "cfg" / "flip.toml", RunCfg, args.set).task, seed=entry["seed"])
+    schedule = parse(entry["schedule"], task.modes.names)
+    if len(schedule) != task.horizon:
+        raise ValueError(f"{args.log} was planned over {len(schedule)} steps: give --set task.horizon=...")
+    before = entry["before"]
+    start = make_start(task, task.make_sim(1), entry["x"], before["u"], before["mode"], k=args.step)
+    return task, start, schedule
+
+
+def of_plan(found: Plan, step: int) -> Schedule:
+    """A plan's schedule after so many of its accepted steps."""
+    if not 0 <= step <= len(found.steps):
+        raise ValueError(f"the plan has 0 to {len(found.steps)} accepted steps, got --step {step}")
+    schedule = found.incumbent
+    for switch in (each for switches, _ in found.steps[:step] for each in switches):
+        schedule = schedule.stitch(switch)
+    return schedule
+
+
+def of_cartpole(args: Args, console: Console) -> tuple[Task, Start, Schedule]:
+    """A plan of the cartpole made here, its steps told, and the schedule after some of them."""
+    cfg = override(CartpoleCfg(), args.set)
+    task = cartpole(cfg)
+    idle = [cfg.num_modes // 2] * cfg.horizon
+    start = make_start(task, task.make_sim(1), initial_state(cfg))
+    found = plan(task, start, schedule=idle, budget=Budget(control_steps=args.control_steps))
+    schedule, before = of_plan(found, args.step), found.incumbent_terms
+    for number, ((switches, after), cost) in enumerate(zip(found.steps, found.costs[1:], strict=True), 1):
+        what = ", ".join(f"{task.modes.names[s.mode]} from {s.start} for {s.duration}" for s in switches)
+        console.print(f"{number:3}: {what}: cost {cost:.4g}: {reason(before, after)}", highlight=False)
+        before = after
+    return task, start, schedule
+
+
 @torch.no_grad()
 def main(args: Args) -> None:
-    """Read, roll out, draw, say why."""
-    with one_line_errors():
-        entry = read(args.log, args.step)
-        task = flip_task(load(ROOT / "cfg" / "flip.toml", RunCfg, args.set).task)
-        schedule = parse(entry["schedule"], task.modes.names)
-        if len(schedule) != task.horizon:
-            raise ValueError(
-                f"{args.log} was planned over {len(schedule)} steps: give --set task.horizon=..."
-            )
-    sim = task.make_sim(args.worlds)
-    start = make_start(task, sim, entry["x"], entry["before"]["u"], entry["before"]["mode"], k=args.step)
+    """Read or plan, roll out, draw, say why."""
     console = Console()
+    with one_line_errors():
+        flip = args.task == "flip"
+        task, start, schedule = of_log(args) if flip else of_cartpole(args, console)
+    sim = task.make_sim(args.worlds)
     with console.status("rolling out all switches"):
         found = landscape(task, Evaluator(task, sim, start), schedule)
-    out = args.out or args.log.with_name(f"{args.log.stem}_step_{args.step}.png")
-    better = float(np.nanmin(found.costs))
-    draw(out, found, f"{schedule}: cost {found.cost:.2f}, with the best switch {better:.2f}: {found.best}")
+    default = ROOT / "out" / f"{args.task}_step_{args.step}.png"
+    if args.log is not None:
+        default = args.log.with_name(f"{args.log.stem}_step_{args.step}.png")
+    out = args.out or default
+    out.parent.mkdir(parents=True, exist_ok=True)
+    better = "no switch lowers it"
+    if found.switch is not None:
+        better = f"with the best switch {np.nanmin(found.costs):.2f}: {found.best}"
+    draw(out, found, f"{schedule}: cost {found.cost:.2f}, {better}")
     console.print(f"{schedule}\n{found.best}", highlight=False)
     for name, before in found.terms[0].items():
         console.print(f"{name:>12} {before:8.3f} -> {found.terms[1][name]:8.3f}", highlight=False)
+    why = "no switch lowers the cost" if found.switch is None else f"why: {reason(*found.terms)}"
+    console.print(why, highlight=False)
     console.print(f"{out}")
 
 
