@@ -90,15 +90,20 @@ class Estimator:
         detectors: contact detection of each foot.
         contact: what it says, (4,) bool.
         falls: how often the estimate was lost and begun anew.
+        anew: time of the readings after which it was told to begin anew [s]; -inf: never.
     """
 
     def __init__(self, cfg: EstimatorCfg | None = None):
         self.cfg = cfg or EstimatorCfg()
-        self.falls = 0
-        self.reset()
+        self.falls, self.anew = 0, -math.inf
+        self._forget()
 
     def reset(self) -> None:
         """Forget everything; the next readings must come from a still stand."""
+        self.anew = self._t
+        self._forget()
+
+    def _forget(self) -> None:
         self.ekf = Ekf(self.cfg.noise)
         self.detectors = [FootContact(self.cfg.contact) for _ in range(4)]
         self.contact, self._carried = np.zeros(4, dtype=bool), False
@@ -132,7 +137,7 @@ class Estimator:
         if not t > self._t:
             return self._estimate
         if t - self._t > self.cfg.max_gap or (self._ready and t - self._good > self.cfg.max_gap):
-            self.reset()
+            self._forget()
         dt, self._t = t - self._t, t
         last, good, blind = self._imu, self._readable(gyro, acc), t - self._good
         if good:
@@ -160,7 +165,7 @@ class Estimator:
         used = self._feet(leg, tau.tolist(), force.tolist(), known, dt)
         if self._fallen(leg, self._lies(dt) or bool(used.any()), dt):
             self.falls += 1
-            self.reset()
+            self._forget()
             self._t = self._good = t
             return None
         self._estimate = self._output(used)

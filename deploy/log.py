@@ -19,19 +19,21 @@ import json
 import os
 import struct
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 from mcap.writer import Writer
 
 from deploy.ekf import N
 from deploy.process import Job, told, until_told
+from deploy.settings import DeployCfg
+from hmc.cfg import dump, load
 
-VERSION = "2"
+VERSION = "3"
 METADATA = "hmc"
 STATE, COMMAND, TICK_RECORD, PLAN, EVENT = range(5)
 TOPICS = ("rt/lowstate", "rt/lowcmd", "tick", "plan", "event")
@@ -52,6 +54,7 @@ TICK = np.dtype(
         ("variance", "f8", N),
         ("u", "f8", 12),
         ("contact", "i4", 4),
+        ("anew", "i8"),  # the robot's clock when the estimator was told to begin anew; -1: never
     ]
 )
 _HEAD = struct.Struct("<IBq")  # octets that follow, kind, wall clock [ns]
@@ -144,22 +147,7 @@ def read(path: Path) -> Iterator[tuple[str, float, Any]]:
     Raises:
         LogError: not a log of this version; names what it is.
     """
-    if not path.is_file():
-        raise LogError(f"log {path}: no such file")
-    with path.open("rb") as file:
-        try:
-            reader = make_reader(file)
-            found = {record.name: record.metadata for record in reader.iter_metadata()}
-        except Exception as error:  # mcap and its decompressors have no type in common for damage
-            raise LogError(
-                f"log {path}: not a whole MCAP file ({type(error).__name__} {error}): a run that was cut "
-                "short leaves one that `mcap recover` can mend"
-            ) from None
-        version = found.get(METADATA, {}).get("version", "none")
-        if version != VERSION:
-            raise LogError(
-                f"log {path}: is of version {version}, expected {VERSION}: take the hmc that wrote it"
-            )
+    with _opened(path) as (reader, _):
         try:
             for _, channel, message in reader.iter_messages():
                 is_json = channel.message_encoding == "json"
@@ -170,6 +158,39 @@ def read(path: Path) -> Iterator[tuple[str, float, Any]]:
                 )
         except Exception as error:
             raise LogError(f"log {path}: damaged ({type(error).__name__} {error})") from None
+
+
+def metadata(path: Path) -> dict[str, str]:
+    """What a log says of its run, see `about`.
+
+    Raises:
+        LogError: not a log of this version; names what it is.
+    """
+    with _opened(path) as (_, found):
+        return found
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[McapReader, dict[str, str]]]:
+    """A log's reader and metadata."""
+    if not path.is_file():
+        raise LogError(f"log {path}: no such file")
+    with path.open("rb") as file:
+        try:
+            reader = make_reader(file)
+            records = {record.name: record.metadata for record in reader.iter_metadata()}
+        except Exception as error:  # mcap and its decompressors have no type in common for damage
+            raise LogError(
+                f"log {path}: not a whole MCAP file ({type(error).__name__} {error}): a run that was cut "
+                "short leaves one that `mcap recover` can mend"
+            ) from None
+        if (found := records.get(METADATA)) is None:
+            raise LogError(f"log {path}: an MCAP file of another program: give a run.mcap of deploy/go2.py")
+        if (version := found.get("version", "none")) != VERSION:
+            raise LogError(
+                f"log {path}: is of version {version}, expected {VERSION}: take the hmc that wrote it"
+            )
+        yield reader, found
 
 
 def _schema(kind: int) -> bytes:
@@ -186,11 +207,17 @@ def _schema(kind: int) -> bytes:
     return json.dumps({"type": "object", "properties": properties, "required": list(properties)}).encode()
 
 
-def main(job: Job, about: Callable[[], dict[str, str]] = dict) -> None:
+def about(job: Job) -> dict[str, str]:
+    """What a log says of its run: where the robot was, and the settings as lines of `hmc.cfg.dump`."""
+    settings = dump(load(job.cfg, DeployCfg, job.set))
+    return {"domain": str(job.domain), "interface": job.interface, "settings": settings}
+
+
+def main(job: Job) -> None:
     """Be the log's process until the control process has ended; SIGTERM is not needed and does nothing."""
     until_told(parent_matters=False)
     with os.fdopen(job.log, "rb") as source:
-        write(source, Path(job.path), {"domain": str(job.domain), "interface": job.interface, **about()})
+        write(source, Path(job.path), about(job))
 
 
 if __name__ == "__main__":

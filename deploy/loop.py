@@ -26,7 +26,7 @@ from deploy.observe import pitch
 from deploy.process import ROOT, Job, real_time, told, until_told
 from deploy.safety import Phase
 from deploy.settings import DeployCfg
-from deploy.slots import Board, said, text
+from deploy.slots import Board, said, tally, text
 from deploy.timing import Lateness, Silence
 from hmc.cfg import load
 from hmc.go2 import facts
@@ -257,7 +257,7 @@ class Loop:
             control.missed,
             self._lateness.bins,
         )
-        status["faults"] = sum(control.checks.counts.values())
+        status["faults"] = tally({**control.checks.counts, "not logged": self._recorder.lost})
         status["plans"] = performer.counts["taken"]
         status["late_plans"] = performer.counts["late"] + performer.counts["stale"]
         status["charge"] = control.state.charge if control.state else 0
@@ -274,6 +274,7 @@ class Loop:
         )
         tick["plan"], tick["late"], tick["compute"] = plan.number if plan else 0, late, 1e3 * (left - now)
         tick["u"] = np.nan_to_num(control.target)
+        tick["anew"] = round(1e3 * max(control.estimator.anew, -0.001))
         if estimate is not None:
             tick["x"], tick["variance"], tick["contact"] = estimate.x, estimate.P.diagonal(), estimate.contact
         self._recorder.add(TICK_RECORD, tick.tobytes())

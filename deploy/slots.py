@@ -12,10 +12,12 @@ import mmap
 import os
 import struct
 import zlib
+from collections.abc import Mapping
 
 import numpy as np
 
 TEXT = 160  # octets of a reason
+COUNTS = 320  # octets of counts in words
 
 # Times are those of the monotonic clock, which all processes of a machine share [s]; ticks are control steps
 # since the control process started.
@@ -62,7 +64,7 @@ STATUS = np.dtype(
         ("ticks", "i8"),
         ("missed", "i8"),
         ("late", "i8", BINS),  # ticks by lateness, see deploy.timing
-        ("faults", "i8"),
+        ("faults", f"S{COUNTS}"),  # by kind, see `tally`
         ("plans", "i8"),
         ("late_plans", "i8"),
         ("pitch", "f4"),  # deg
@@ -170,10 +172,16 @@ class Board:
 
 
 def said(reason: object) -> str:
-    """The reason in a slot's value."""
+    """The words in a slot's value."""
     return reason.decode(errors="replace") if isinstance(reason, bytes) else ""
 
 
 def text(reason: str) -> bytes:
     """A reason as it goes into a slot."""
     return reason.encode()[:TEXT]
+
+
+def tally(counts: Mapping[str, int]) -> bytes:
+    """Counts by kind in words as they go into a slot, the largest first; what is 0 is left out."""
+    found = sorted(((count, kind) for kind, count in counts.items() if count), reverse=True)
+    return ", ".join(f"{kind} {count}" for count, kind in found).encode()[:COUNTS]

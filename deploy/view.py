@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -21,13 +22,15 @@ def picture(status: np.ndarray) -> RenderableType:
     phase, mode = Phase(int(status["phase"])), int(status["mode"])
     table = Table(show_header=False, box=None)
     color = _COLORS.get(phase, "yellow")
-    table.add_row("phase", f"[{color}]{phase.name.lower()}[/] {said(status['reason'].item())}")
+    reason = escape(said(status["reason"].item()))
+    table.add_row("phase", f"[{color}]{phase.name.lower()}[/] {reason}")
     table.add_row("mode", NAMES[mode] if mode >= 0 and phase == Phase.HYBRID else "-")
     table.add_row("body", f"pitch {status['pitch']:+.0f} deg, height {status['height']:.2f} m")
     table.add_row("battery", f"{status['charge']} %")
     age = f"{20 * int(status['plan_age'])} ms" if status["plan_age"] >= 0 else "-"
     table.add_row("plan", f"age {age}, {status['plans']} taken over, {status['late_plans']} too late")
-    table.add_row("ticks", f"{status['ticks']}, {status['missed']} missed, {status['faults']} bad frames")
+    table.add_row("ticks", f"{status['ticks']}, {status['missed']} missed")
+    table.add_row("faults", said(status["faults"].item()) or "none")
     return Group(table, histogram(status["late"]))
 
 

@@ -1,13 +1,13 @@
 """Look at a run of the robot again: `python tools/replay.py out/deploy/run.mcap`.
 
 Draws what the log holds, and runs its state frames through the estimator once more: with today's code and
-settings, from the same readings.
+settings of the estimator, from the readings that the run believed.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,12 @@ import tyro  # noqa: E402
 
 from deploy.checks import StateChecks  # noqa: E402
 from deploy.estimator import Estimator  # noqa: E402
-from deploy.log import read  # noqa: E402
+from deploy.log import metadata, read  # noqa: E402
 from deploy.modes import NAMES  # noqa: E402
 from deploy.observe import pitch, vertical  # noqa: E402
 from deploy.safety import Phase  # noqa: E402
-from deploy.settings import InputCfg  # noqa: E402
+from deploy.settings import DeployCfg, InputCfg  # noqa: E402
+from hmc.cfg import override  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 
 
@@ -48,7 +49,7 @@ class Replay:
     Attributes:
         ticks: control steps, as in the log.
         again: estimated states by the robot's clock [ms], (37,) each, of the estimator run anew.
-        refused: frames that are not believed.
+        refused: frames that are not believed; without those that never came.
     """
 
     ticks: list[dict[str, Any]]
@@ -56,12 +57,8 @@ class Replay:
     refused: int
 
     def difference(self) -> tuple[float, float]:
-        """Largest difference of height [m] and attitude [rad] between the log's estimate and the new one.
-
-        Both begin anew where the robot stood up, which only the log knows; so only what follows the hybrid
-        phase's begin counts.
-        """
-        rows = [tick for tick in self.ticks if tick["phase"] == Phase.HYBRID and tick["ms"] in self.again]
+        """Largest difference of height [m] and attitude [rad] between the log's estimate and the new one."""
+        rows = [tick for tick in self.ticks if any(tick["variance"]) and tick["ms"] in self.again]
         if not rows:
             return np.nan, np.nan
         old = np.array([tick["x"] for tick in rows])
@@ -80,33 +77,34 @@ def replay(path: Path) -> Replay:
     Raises:
         LogError: not a log of this version.
     """
-    checks, estimator = StateChecks(InputCfg(max_age=np.inf, stall=np.inf)), Estimator()
-    ticks: list[dict[str, Any]] = []
+    ticks: list[dict[str, Any]] = [content for topic, _, content in read(path) if topic == "tick"]
+    anew = {tick["anew"] for tick in ticks}  # where the robot had stood up
+    checks, estimator = StateChecks(limits(path)), Estimator()
     again: dict[int, np.ndarray] = {}
     for topic, _, content in read(path):
-        if topic == "tick":
-            # at its end the robot has stood up, and the estimator began anew
-            if (
-                content["phase"] == Phase.STAND
-                and not any(content["variance"])
-                and ticks
-                and any(ticks[-1]["variance"])
-            ):
-                estimator.reset()
-            ticks.append(content)
-        elif topic == "rt/lowstate" and (state := checks.take(content, 0.0)) is not None:
-            t = 0.001 * checks.ms
-            force = state.foot_force.astype(np.float64)
-            found = estimator.update(t, state.gyro, state.acc, state.q, state.dq, state.tau, force)
-            if found is not None:
-                again[checks.ms] = found.x
-    return Replay(ticks, again, sum(checks.counts.values()))
+        if topic != "rt/lowstate" or (state := checks.take(content, 0.0)) is None:
+            continue
+        t = 0.001 * checks.ms
+        force = state.foot_force.astype(np.float64)
+        found = estimator.update(t, state.gyro, state.acc, state.q, state.dq, state.tau, force)
+        if found is not None:
+            again[checks.ms] = found.x
+        if checks.ms in anew:
+            estimator.reset()
+    return Replay(ticks, again, sum(count for kind, count in checks.counts.items() if kind != "gap"))
+
+
+def limits(path: Path) -> InputCfg:
+    """What a frame had to be like in the run that wrote a log; ages are the run's, not the replay's."""
+    lines = metadata(path).get("settings", "").splitlines()
+    cfg = override(DeployCfg(), [line for line in lines if line.startswith("input.")]).input
+    return replace(cfg, max_age=np.inf, stall=np.inf)
 
 
 def draw(it: Replay, path: Path) -> None:
     """Phases and modes, pitch and height, speed, targets, lateness."""
     t = np.array([tick["k"] for tick in it.ticks]) * 0.02
-    x = np.array([tick["x"] for tick in it.ticks])
+    x = np.array([tick["x"] if any(tick["variance"]) else [np.nan] * 37 for tick in it.ticks])  # or unknown
     figure, axes = plt.subplots(5, 1, figsize=(10, 12), sharex=True, layout="constrained")
     axes[0].step(t, [tick["phase"] for tick in it.ticks], where="post")
     axes[0].set_yticks(list(Phase), [phase.name.lower() for phase in Phase])
@@ -134,8 +132,8 @@ def main(args: Args) -> None:
         it = replay(args.log)
         if not it.ticks:
             raise ValueError(f"log {args.log}: holds no control step")
-    out = args.out or args.log.with_name("replay.png")
-    draw(it, out)
+        out = args.out or args.log.with_name("replay.png")
+        draw(it, out)
     height, angle = it.difference()
     print(
         f"{len(it.ticks)} control steps, {len(it.again)} states estimated again, {it.refused} frames refused"
