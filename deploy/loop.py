@@ -301,6 +301,8 @@ def policies(foot: str, hand: str) -> dict[int, Network]:
     given = {FOOT: foot, HAND: hand}
     own = {mode: ROOT / "hmc" / "go2" / "policies" / f"{NAMES[mode]}stand.onnx" for mode in given}
     made = {mode: Network(Path(path) if path else own[mode]) for mode, path in given.items()}
+    for mode, network in made.items():
+        network.expect(f"{NAMES[mode]}stand")
     for network in made.values():  # the first inference takes several times as long as others: not in a tick
         network.run(np.zeros((1, facts.OBS_SIZE), np.float32))
     return made

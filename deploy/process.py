@@ -11,11 +11,12 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+_PATHS = ("cfg", "path", "foot", "hand", "task")  # of a job
 _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # of mlockall(2)
 # matrices of 30 rows only lose by threads, which wait for each other in loops that fill a core
@@ -69,7 +70,14 @@ class Job:
 
 
 def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:
-    """Start a module of `deploy` as a process that inherits these descriptors."""
+    """Start a module of `deploy` as a process that inherits these descriptors.
+
+    It runs in the project's folder; what the job's paths are relative to is this process's.
+    """
+    paths: dict[str, Any] = {
+        name: str(Path(path).absolute()) for name in _PATHS if (path := getattr(job, name))
+    }
+    job = replace(job, **paths)
     command = [sys.executable, "-m", f"deploy.{module}", json.dumps(asdict(job))]
     return subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, pass_fds=descriptors, text=True, **streams)
 

@@ -115,6 +115,21 @@ class Network:
         self.pose = np.array(self.metadata["default_pose"], dtype=np.float64)
         self.scale = float(self.metadata["action_scale"])
 
+    def expect(self, mode: str) -> None:
+        """See that it is a policy of this mode that obeys no command.
+
+        Raises:
+            ValueError: it is not; names the field of its metadata.
+        """
+        remedy = f"give one that python train/ppo.py --mode {mode} has trained"
+        if self.command:
+            raise ValueError(
+                f"policy {self.path}: command is {', '.join(self.command)}, expected none, as nothing "
+                f"commands it here: {remedy}"
+            )
+        if self.mode != mode:
+            raise ValueError(f"policy {self.path}: mode is {self.mode!r}, expected {mode!r}: {remedy}")
+
     def act(self, x: Array, u: Array, anchor: Array, command: Array | None = None) -> NDArray[np.float64]:
         """Joint targets [rad], (n, 12); arguments as of `observe`, and the command (n, c) if it obeys one."""
         obs = observe(x, u, anchor)
