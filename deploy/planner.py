@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -296,21 +297,36 @@ def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
             board.plan.write(record)
 
 
-def main(job: Job) -> None:
-    """Be the planner until SIGTERM."""
+def planner_of(job: Job) -> Planner:
+    """The planner that a job asks for; it reckons with the policies that the control process runs.
+
+    Raises:
+        ValueError: settings that are none, or policies for plans alone.
+    """
+    cfg = load(ROOT / "cfg" / "planner.toml", PlannerCfg, job.search)
+    task = load(job.task, FlipCfg, (*cfg.task, *job.task_set), table="task")
+    for name, given in (("foot", task.foot), ("hand", task.hand)):
+        if given:
+            raise ValueError(f"task.{name} is {given} for plans alone: use --{name}, for control as well")
+    rules = load(job.cfg, DeployCfg, job.set).plan
+    task = replace(task, foot=job.foot, hand=job.hand)
+    return Planner(task, cfg, rules, seed=job.seed, threads=job.threads, speed=job.speed)
+
+
+def main(job: Job) -> int:
+    """Be the planner until SIGTERM; exit status 2 and one line if it is asked for what it cannot do."""
     stopped = until_told()
     if not allowed():
         os.nice(NICE)
     torch.set_num_threads(1)
-    cfg = load(ROOT / "cfg" / "planner.toml", PlannerCfg, job.search)
-    task = load(job.task, FlipCfg, (*cfg.task, *job.task_set), table="task")
-    rules = load(job.cfg, DeployCfg, job.set).plan
-    run(
-        Board(job.board),
-        Planner(task, cfg, rules, seed=job.seed, threads=job.threads, speed=job.speed),
-        stopped,
-    )
+    try:
+        planner = planner_of(job)
+    except ValueError as error:
+        print(f"planner: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    run(Board(job.board), planner, stopped)
+    return 0
 
 
 if __name__ == "__main__":
-    main(told())
+    sys.exit(main(told()))

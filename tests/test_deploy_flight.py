@@ -12,7 +12,8 @@ import pytest
 from deploy.control import Control
 from deploy.loop import policies
 from deploy.modes import FOOT, HAND, JUMP, NONE, Plan
-from deploy.planner import Planner, PlannerCfg
+from deploy.planner import Planner, PlannerCfg, main, planner_of
+from deploy.process import Job
 from deploy.remote import Button, Remote
 from deploy.safety import Phase
 from deploy.settings import DeployCfg
@@ -21,8 +22,9 @@ from deploy.summary import stages
 from hmc import make_start
 from hmc.cfg import load
 from hmc.go2.model import DT
+from hmc.go2.policy import Policy
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
-from hmc.go2.task import FlipCfg
+from hmc.go2.task import FlipCfg, policy_path
 from tools.robot.standin import Settings, StandIn
 
 CFG = load(Path("cfg/deploy.toml"), DeployCfg)
@@ -178,3 +180,41 @@ def test_other_robots_land_a_flip_and_not_a_fall() -> None:
     assert alone.landed(start, fall) == 0.0
     upside = make_start(it.task, it._one, HANDSTAND.state(), HANDSTAND.state()[7:19])
     assert it.landed(upside, [HAND] * horizon) >= 8 / 9
+
+
+def test_plans_are_made_with_the_policies_that_run(tmp_path: Path) -> None:
+    """Those of the job, in both processes; where it names none, those of the package."""
+    given = {name: tmp_path / f"{name}.onnx" for name in ("foot", "hand")}
+    for name, path in given.items():
+        path.write_bytes(policy_path(f"{name}stand").read_bytes())
+    for job, paths in (
+        (Job(foot=str(given["foot"]), hand=str(given["hand"]), threads=1), given),
+        (Job(threads=1), {name: policy_path(f"{name}stand") for name in given}),
+    ):
+        modes, run = planner_of(job).task.modes, policies(job.foot, job.hand)
+        for mode, name in ((FOOT, "foot"), (HAND, "hand")):
+            planned = modes[mode]
+            assert isinstance(planned, Policy)
+            assert planned.network.path.samefile(paths[name])
+            assert run[mode].path.samefile(paths[name])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"task_set": ("foot=other.onnx",)}, "task.foot is other.onnx for plans alone: use --foot"),
+        ({"task_set": ("horizn=3",)}, "unknown key horizn; did you mean horizon?"),
+        ({"search": ("lead=50",)}, "horizon must be more than the lead of 50"),
+        ({"hand": "none.onnx"}, "policy none.onnx: no such file"),
+    ],
+)
+def test_what_cannot_be_planned_is_one_line(
+    wrong: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deploy.planner.until_told", lambda: lambda: True)
+    monkeypatch.setattr("os.nice", lambda _: 0)
+    assert main(Job(**wrong)) == 2
+    _, err = capsys.readouterr()
+    assert err.startswith("planner: ")
+    assert told in err
+    assert err.count("\n") == 1
