@@ -156,7 +156,7 @@ def test_errors_are_one_line(
     args: Args, told: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # the test run keeps its own handlers
-    assert main(args) == 1
+    assert main(args) == 2
     _, err = capsys.readouterr()
     assert err.startswith("go2_robot: ")
     assert told in err

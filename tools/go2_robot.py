@@ -17,7 +17,7 @@ from tools.robot.process import Args, run
 
 
 def main(args: Args) -> int:
-    """Be the robot until its time is over, or SIGINT or SIGTERM, or it has lost its parent."""
+    """Be the robot until told to end or without its parent; exit status 2 and one line on bad input."""
     told: list[int] = []
 
     def stopped() -> bool:
@@ -31,10 +31,16 @@ def main(args: Args) -> int:
         signal.signal(name, lambda number, _: told.append(number))
     try:
         run(args, stopped, say)
-    except (LinkError, ValueError, RuntimeError) as error:
-        print(f"go2_robot: {error}", file=sys.stderr)
-        return 1
+    except (LinkError, ValueError, OSError) as error:
+        return _said(error, 2)
+    except RuntimeError as error:  # the simulated robot diverged
+        return _said(error, 1)
     return 0
+
+
+def _said(error: Exception, status: int) -> int:
+    print(f"go2_robot: {' '.join(str(error).split())}", file=sys.stderr)
+    return status
 
 
 if __name__ == "__main__":
