@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -56,6 +58,33 @@ def sdk_controller(domain: int) -> None:
     os._exit(0)
 
 
+def sdk_robot(domain: int) -> None:
+    """Unitree's SDK as the robot: publishes a state, and prints the commands that it reads, each once."""
+    import unitree_interface
+
+    assert domain == 0, "the SDK's domain"
+    peer: Any = unitree_interface.UnitreeInterface.create_go2("lo")  # its stubs leave the robot's side out
+    now, told = unitree_interface.LowState(12), state()
+    motor, imu = now.motor, now.imu
+    order = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]  # the SDK counts as the robot does
+    motor.q, motor.dq, motor.tau_est = (each[order].tolist() for each in (told.q, told.dq, told.tau))
+    motor.temperature = told.temperature[order].tolist()
+    imu.quat, imu.omega, imu.accel = told.quat.tolist(), told.gyro.tolist(), told.acc.tolist()
+    now.motor, now.imu = motor, imu
+    last: list[float] = []
+    until = time.monotonic() + SECONDS
+    while time.monotonic() < until and last[:1] != [0.0]:
+        peer.publish_low_state(now)
+        it = peer.read_incoming_command()
+        read = [*it.q_target, *it.dq_target, *it.tau_ff, *it.kp, *it.kd]
+        if read != last and (last or any(read)):
+            print(*read, flush=True)
+            last = read
+        ctypes.CDLL(None).fflush(None)  # what the SDK itself prints
+        time.sleep(0.002)
+    os._exit(0)  # as above
+
+
 def sdk_switcher(domain: int) -> None:
     """Unitree's SDK as the robot's motion switcher, until killed."""
     import unitree_interface
@@ -69,6 +98,7 @@ def sdk_switcher(domain: int) -> None:
 PARTS: dict[str, Callable[[int], None]] = {
     "robot": robot,
     "sdk_controller": sdk_controller,
+    "sdk_robot": sdk_robot,
     "sdk_switcher": sdk_switcher,
 }
 

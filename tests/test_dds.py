@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from tests import wire
 PEERS = Path(__file__).parent / "dds_peers.py"
 DOMAIN = 20 + os.getpid() % 100  # test runs side by side do not hear each other
 OTHER = 2 + os.getpid() % 18
+ROBOT_ORDER = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]  # the SDK counts as the robot does
 
 sdk = pytest.mark.skipif(
     importlib.util.find_spec("unitree_interface") is None,
@@ -43,6 +44,15 @@ def peer(part: str, domain: int) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.kill()
+
+
+def listening(process: subprocess.Popen[str]) -> tuple[list[str], threading.Thread]:
+    """The lines that a process has printed so far, and the thread that adds to them until it ends."""
+    assert process.stdout is not None
+    lines: list[str] = []
+    thread = threading.Thread(target=lines.extend, args=(process.stdout,))
+    thread.start()
+    return lines, thread
 
 
 def test_two_processes_exchange_both_topics() -> None:
@@ -198,7 +208,7 @@ def test_unitree_sdk_reads_states_and_its_commands_are_read() -> None:
             heard += commands.take(0.002)
         out, _ = process.communicate()
     assert process.returncode == 0, "the SDK's process died: see deploy/messages.py on uint8"
-    order = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]  # the SDK counts as the robot does
+    order = ROBOT_ORDER
     read = [float(word) for word in out.splitlines()[-1].split()]
     assert read == [*state.q[order], *state.quat, *state.temperature[order]]
 
@@ -207,6 +217,43 @@ def test_unitree_sdk_reads_states_and_its_commands_are_read() -> None:
     assert all(it.crc_ok for it in found)
     assert np.array_equal(found[-1].motors.q, state.q)
     assert np.array_equal(found[-1].motors.kp[order], np.arange(12))
+
+
+@sdk
+def test_unitree_sdk_reads_commands_and_its_states_are_read() -> None:
+    """As on the robot: the SDK's process of DDS 0.10.2 believes our commands, but for one whose checksum is
+    wrong by a bit; and the checksum of its states is ours."""
+    link, order = Link(0), ROBOT_ORDER
+    commands, states = link.publisher("rt/lowcmd", LowCmd_), link.subscriber("rt/lowstate", LowState_)
+    first, damaged, last = (wire.command(seed) for seed in (1, 2, 3))
+    last.q[order[0]] = 0.0  # of the robot's first motor: the peer ends
+    wrong = bytearray(encode_command(damaged))
+    wrong[-1] ^= 1
+    heard: list[bytes] = []
+    with peer("sdk_robot", 0) as process:
+        said, listener = listening(process)
+
+        def numbers() -> list[list[float]]:
+            return [[float(word) for word in line.split()] for line in said if line.count(" ") == 59]
+
+        def send(frame: bytes, until: Callable[[], object]) -> None:
+            while process.poll() is None and not until():
+                commands.write(frame)
+                heard.extend(states.take(0.005))
+
+        send(encode_command(first), numbers)
+        send(bytes(wrong), lambda: any("CRC Error" in line for line in said))
+        send(encode_command(last), lambda: False)
+        listener.join()
+        assert process.wait() == 0, "the SDK's process died: see deploy/messages.py on uint8"
+    assert any("CRC Error" in line for line in said)
+    assert numbers() == [np.concatenate([it[order] for it in each[:5]]).tolist() for each in (first, last)]
+
+    found, told = [decode_state(frame) for frame in heard], wire.state()
+    assert found
+    assert all(it.crc_ok for it in found)
+    for name in ("quat", "gyro", "acc", "q", "dq", "tau", "temperature"):
+        assert np.array_equal(getattr(found[-1], name), getattr(told, name))
 
 
 @sdk
