@@ -29,8 +29,8 @@ demo: $(READY) ## The Go2 plans its way from hind legs to a handstand, three see
 test: $(READY) ## All tests
 	$(BIN)/python -m pytest
 
-test-deploy: $(READY) ## The longer tests of the robot's processes, some minutes
-	$(BIN)/python -m pytest -m deploy
+test-deploy: $(READY) ## All faults in all phases, and the longer tests of the robot's processes
+	$(BIN)/python -m pytest -m "deploy or matrix"
 
 lint: $(READY) ## Style, format and types; changes nothing
 	$(BIN)/ruff check .

@@ -151,6 +151,7 @@ def duplicate(control: Control) -> Control:
     return copy.deepcopy(control, {id(it): it for it in control.performer._policies.values()})
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("phase", Phase, ids=lambda phase: phase.name.lower())
 def test_every_fault_in_every_phase_is_safe_within_100_ms(met: Met, phase: Phase, fault: str):
