@@ -23,7 +23,8 @@ from deploy.motion_switcher import (
 from deploy.remote import Button, Remote, pack
 from deploy.safety import PEAK_TORQUE, Phase
 from hmc.go2.stances import FOOTSTAND
-from tests.test_deploy_control import Rig, Wire, check, duplicate
+from tests.test_deploy_control import Rig, check, duplicate
+from tests.test_deploy_loop import Wire
 from tools.robot.motors import hold
 from tools.robot.standin import Settings, StandIn
 

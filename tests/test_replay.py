@@ -33,7 +33,7 @@ from deploy.settings import DeployCfg
 from deploy.slots import Board
 from deploy.so3 import multiply, quaternion
 from hmc.cfg import load
-from tests.test_deploy_control import Wire
+from tests.test_deploy_loop import Wire
 from tools.replay import Args, Replay, main, replay
 from tools.robot.standin import Settings, StandIn
 

@@ -18,7 +18,8 @@ from deploy.modes import JUMP, NONE
 from deploy.safety import Phase
 from deploy.slots import BINS, COUNTS, STATUS, Board, said, tally, text
 from deploy.view import View, picture
-from tests.test_deploy_control import Rig, Wire
+from tests.test_deploy_control import Rig
+from tests.test_deploy_loop import Wire
 
 COUNTED = {"gap": 12, "checksum": 3, "range of the gyroscope": 0, "not a number": 7}
 
