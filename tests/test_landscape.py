@@ -62,7 +62,7 @@ def test_the_mark_is_on_the_best_switch_by_its_own_duration(tmp_path, monkeypatc
     assert found.switch is not None
     panels = shown(found, tmp_path, monkeypatch).axes[:3]
     for mode, axis in enumerate(panels):
-        marks = [line.get_xydata().tolist() for line in axis.lines]
+        marks = [np.asarray(line.get_xydata()).tolist() for line in axis.lines]
         mine = [[[found.switch.start, found.switch.duration]]] if mode == found.switch.mode else []
         assert marks == mine
         left, right, low, high = axis.images[0].get_extent()
