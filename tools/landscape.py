@@ -117,7 +117,7 @@ def draw(path: Path, found: Landscape, title: str) -> None:
     change = found.costs - found.cost if np.isfinite(found.cost) else found.costs
     finite = np.abs(change[np.isfinite(change)])
     reach = (np.quantile(finite, 0.9) if len(finite) else 0.0) or 1.0
-    figure, axes = plt.subplots(1, len(names), figsize=(4 * len(names), 4.1), constrained_layout=True,
+    figure, axes = plt.subplots(1, len(names), figsize=(4 * len(names), 4.6), constrained_layout=True,
                                 sharey=True, squeeze=False)  # fmt: skip
     place = {"origin": "lower", "extent": (-0.5, horizon - 0.5, 0.5, horizon + 0.5)}
     for mode, (axis, name, values) in enumerate(zip(axes[0], names, change, strict=True)):
