@@ -217,7 +217,7 @@ def plan(
         u: input applied last, (nu,); zero if left out.
         mode: the mode now running, by index or name.
         memory: what that mode remembers, (its memory_size,): a schedule that begins with `mode` goes on
-            with it. Left out, the mode is entered anew.
+            with it. Left out, it is made anew; for rules the mode goes on running.
         k: control steps since the start of the task.
         snapshot: the engine's snapshot row of x, if the world is simulated by the same engine.
         ran: control steps that the running mode has run, for rules on dwell times; None: long enough.
