@@ -61,9 +61,9 @@ class Invariant:
 
     def step(self, frame: Frame, contact: Flags) -> None:
         self._propagate(frame)
-        C, s = self.C, frame.leg.foot - IMU
+        s = frame.leg.foot - IMU
         for leg in range(4):
-            at = slice(9 + 3 * leg, 12 + 3 * leg)
+            at, C = slice(9 + 3 * leg, 12 + 3 * leg), self.C  # which the foot before has turned
             spread = C @ frame.leg.jacobian[leg]
             noise = self.cfg.joint**2 * spread @ spread.T + 1e-8 * np.eye(3)
             if contact[leg] and not self.stands[leg]:
