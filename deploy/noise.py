@@ -35,7 +35,7 @@ class NoiseCfg:
         kinematics: of a foot's place by kinematics, while its leg sways [m]: wrong links and zeros err anew
             in each posture.
         swing: of that by how far its leg, or the body, has turned lately [m/rad].
-        encoder: of that of a leg that is still, or all but still [m]: an encoder's step is 0.06 mm at a foot,
+        encoder: of that of a leg that is still, or all but still [m]: a step of 15 bits is 0.06 mm at a foot,
             its error 0.015 mm along an axis, but the same for some readings.
         give: of a foot's compliance before the first reading [m/N].
         give_walk: of its random walk [m/N/sqrt(s)].

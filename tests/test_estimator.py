@@ -1,4 +1,4 @@
-"""The estimator on exact stands, under faults, and on short simulated logs."""
+"""The estimator on exact stands and under faults."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from deploy.estimator import Estimator, EstimatorCfg
 from deploy.kinematics import FOOT_RADIUS, IMU, legs
 from deploy.start import Start, StartCfg
 from tests.legged import DT, STANDS, Stand, stand
-from tools.estimators.measure import consistency, gates, outputs, play, truth
-from tools.estimators.sensors import sense
-from tools.estimators.simulate import simulate
 
 
 def tilt(estimate: Estimate, robot: Stand) -> float:
@@ -311,63 +308,6 @@ def test_without_flat_ground_the_height_is_free():
     assert tied.P[8, 8] < 0.9 * free.P[8, 8]
 
 
-@pytest.mark.parametrize(
-    ("motion", "seconds", "speed", "seeds"),
-    # in the long one the feet of seed 1002 slide before they lift off, and give way by turns, a hundred times
-    [
-        ("footstand", 2.0, 0.01, [7]),
-        ("footstand", 4.0, 0.01, [1001]),
-        ("handstand", 2.0, 0.01, [7]),
-        ("handstand", 20.0, 0.006, [1002]),
-        ("flip", 3.0, 0.02, [7, 8]),
-    ],
-)
-def test_logs(motion, seconds, speed, seeds):
-    assert np.mean([judged(motion, seconds, speed, seed) for seed in seeds]) < 0.01
-
-
-def judged(motion: str, seconds: float, speed: float, seed: int) -> float:
-    """The share of good updates that a log's estimates refused; all else is judged here."""
-    log = simulate(motion, seconds, seed)
-    readings = sense(log, seed)
-    estimates, _ = play(readings)
-    late = log.t[readings.row] > 1.1  # it has found a quarter of a second of standing still by then
-    out, true = outputs(estimates)[late], truth(log, readings.row)[late]
-    assert log.kept
-    assert np.sqrt(np.mean(np.sum((out[:, :3] - true[:, :3]) ** 2, 1))) < speed
-    assert np.degrees(np.arccos(np.clip((out[:, 3:6] * true[:, 3:6]).sum(1), -1, 1))).max() < 1.5
-    assert np.abs(out[:, 6] - true[:, 6]).max() < 0.03
-    velocity, gravity, biases = consistency(estimates, log, readings)
-    assert 0.3 < velocity < 9.0
-    assert gravity < 8.0
-    assert biases < 18.0
-    for e in estimates[::100]:
-        if e is not None:
-            np.testing.assert_allclose(e.P, e.P.T, rtol=0, atol=1e-15)
-            assert np.linalg.eigvalsh(e.P).min() > 0
-    return gates(estimates, log, readings)[0]
-
-
-@pytest.mark.parametrize("seed", [7, 8])
-def test_a_fall_is_noticed_and_the_robot_found_again_where_it_lies(seed):
-    log = simulate("fall", 4.0, seed)
-    readings = sense(log, seed)
-    estimator, late = Estimator(), log.t[-1] - 0.2
-    estimates = [estimator.update(*reading) for reading in readings]
-    assert log.kept, "it came to rest"
-    assert estimator.falls >= 1
-    true = truth(log, readings.row)
-    for e, at, row in zip(estimates, readings.row, true, strict=True):
-        if log.t[at] < late:
-            continue
-        assert e is not None
-        velocity = e.velocity_body - row[:3]
-        assert np.linalg.norm(velocity) < 0.05
-        assert velocity @ np.linalg.solve(e.velocity_covariance(), velocity) < 30.0
-        assert math.degrees(math.acos(min(1.0, float(e.gravity @ row[3:6])))) < 2.0
-        assert abs(e.position[2] - row[6]) < 0.08
-
-
 def test_a_reset_does_not_forget_the_falls():
     estimator = Estimator()
     estimator.falls = 2
@@ -376,7 +316,7 @@ def test_a_reset_does_not_forget_the_falls():
 
 
 def test_a_tick_is_fast():
-    """The bound on a quiet core is 0.4 ms; here only a tick that has become several times slower fails."""
+    """`bench.py estimator` has the bound of 0.4 ms; here only a tick that is several times slower fails."""
     robot, estimator = stand("home", noise=1.0), Estimator()
     robot.run(estimator, 0.4)
     took = []

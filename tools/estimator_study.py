@@ -114,7 +114,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     heads = ("motion", "filter", "seeds", "velocity RMSE [m/s]", "worst [m/s]", "tilt RMSE [deg]")
     for head in (
         *heads,
-        "height, end [mm]",
+        "height, end: mean, worst [mm]",
         "rejected [%]",
         "falls",
         "time [us]",
@@ -125,7 +125,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
         cells = [row["motion"], row["filter"], str(row["seeds"])]
         if row["seeds"]:
             cells += [f"{row['velocity']:.4f}", f"{row['worst']:.3f}", f"{row['tilt']:.2f}"]
-            cells += [f"{1e3 * row['height']:.1f}"]
+            cells += [f"{1e3 * row['height']:.1f}, {1e3 * row['height_worst']:.1f}"]
             cells += [f"{100 * row['rejected']:.2f}" if "rejected" in row else "", str(row.get("falls", ""))]
             cells.append(f"{row['us']:.0f}")
             for part in NEES if "nees_velocity" in row else ():
@@ -155,7 +155,8 @@ def main(args: Args) -> int:
     settings = {"seeds": args.seeds, "first_seed": args.first_seed, "seconds": args.seconds}
     study.write_json(args.out / "summary.json", {"settings": settings, "rows": rows})
     console.print(table(rows))
-    draw(args.out / "estimator.png", args.seconds, args.first_seed)
+    if "flip" in args.motions:
+        draw(args.out / "estimator.png", args.seconds, args.first_seed)
     return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -135,9 +136,15 @@ def gates(estimates: list[Estimate | None], log: Log, readings: Readings) -> tup
     return refused / max(good, 1), missed / max(slips, 1)
 
 
+@lru_cache(maxsize=1)
+def _recorded(motion: str, seconds: float, seed: int) -> Log:
+    """A motion; where one filter after the other reads it, it is simulated once."""
+    return simulate(motion, seconds, seed)
+
+
 def measure(job: Job, cfg: EstimatorCfg, sensors: SensorCfg) -> Score:
     """Simulate one robot and run the filter on what its sensors say."""
-    log = simulate(job.motion, job.seconds, job.seed)
+    log = _recorded(job.motion, job.seconds, job.seed)
     readings = sense(log, job.seed, sensors)
     true = truth(log, readings.row)
     references: dict[str, Callable[[], Reference]] = {"cheetah": Cheetah, "invariant": Invariant}

@@ -1,53 +1,30 @@
-"""The robot's sensors: clean readings in, what arrives at the computer out, faults included."""
+"""The stand-in robot's sensors on a log: clean readings in, what arrives at the computer out, with faults."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from tools.estimators.simulate import SENSORS, Array, Log
+from tools.robot.body import Body
+from tools.robot.sensors import Encoders, Feet, Imu, Sensors
 
 
 @dataclass(frozen=True)
 class SensorCfg:
-    """Errors of the sensors. "Within" means a uniform draw per robot.
+    """Errors of the sensors, which are the stand-in robot's, and of the way to the computer.
 
     Attributes:
-        gyro: noise of a reading [rad/s].
-        gyro_bias: within [rad/s].
-        gyro_walk: of the bias [rad/s/sqrt(s)].
-        acc: noise of a reading [m/s^2].
-        acc_bias: within [m/s^2].
-        acc_walk: of the bias [m/s^2/sqrt(s)].
-        zero: joint zeros within [rad].
-        step: of an encoder [rad], 15 bit.
-        speed: noise of a joint speed [rad/s].
-        torque: noise of a joint torque [N m].
-        scale: of a foot force sensor within 1 plus or minus.
-        offset: of a foot force sensor within [counts].
-        drift: of that offset [counts/sqrt(s)].
-        force: noise of a foot force [counts].
+        robot: errors of the readings.
+        zero: joint zeros within plus or minus, a uniform draw per robot [rad].
         drop, twice, nan: share of frames that are lost, arrive twice, or have a sensor without numbers.
         stall: stalls of 5 ms a second.
     """
 
-    gyro: float = 0.01
-    gyro_bias: float = 0.005
-    gyro_walk: float = 1e-4
-    acc: float = 0.1
-    acc_bias: float = 0.05
-    acc_walk: float = 1e-3
-    zero: float = math.radians(0.5)
-    step: float = 2.0 * math.pi / 2**15
-    speed: float = 0.05
-    torque: float = 0.2
-    scale: float = 0.2
-    offset: float = 5.0
-    drift: float = 0.3
-    force: float = 1.5
+    robot: Sensors = field(default_factory=Sensors)
+    zero: float = Body.zero
     drop: float = 0.01
     twice: float = 0.01
     nan: float = 0.001
@@ -82,29 +59,23 @@ class Readings:
 
 def sense(log: Log, seed: int, cfg: SensorCfg | None = None) -> Readings:
     """Readings of a log by the sensors of robot `seed`."""
-    cfg, rng, n = cfg or SensorCfg(), np.random.default_rng([seed, 1]), len(log.t)
+    cfg, rng = cfg or SensorCfg(), np.random.default_rng([seed, 1])
+    zeros = rng.uniform(-cfg.zero, cfg.zero, 12)
+    imu, feet = Imu(cfg.robot, rng), Feet(cfg.robot, rng)
+    encoders, rows, biases = Encoders(cfg.robot, zeros, rng), [], []
+    ticks = zip(log.t.tolist(), log.gyro, log.acc, log.x, log.tau, log.force, strict=True)
+    for t, gyro, acc, x, tau, force in ticks:
+        _, *told = imu.read(t, SENSORS, x[3:7], gyro, acc)
+        joints = encoders.told(x[7:19], x[25:], tau)
+        rows.append(np.concatenate([*told, *joints, feet.read(force, SENSORS)]))
+        biases.append(np.concatenate([imu.gyro_bias, imu.acc_bias]))
 
-    def walk(start: float, step: float, size: int) -> Array:
-        """A bias within `start` that walks, (n, size)."""
-        steps = step * math.sqrt(SENSORS) * rng.normal(size=(n, size))
-        return rng.uniform(-start, start, size) + steps.cumsum(0)
-
-    gyro_bias, acc_bias = walk(cfg.gyro_bias, cfg.gyro_walk, 3), walk(cfg.acc_bias, cfg.acc_walk, 3)
-    gyro = log.gyro + gyro_bias + cfg.gyro * rng.normal(size=(n, 3))
-    acc = log.acc + acc_bias + cfg.acc * rng.normal(size=(n, 3))
-    q = log.x[:, 7:19] + rng.uniform(-cfg.zero, cfg.zero, 12)
-    q = cfg.step * np.rint(q / cfg.step)
-    qd = log.x[:, 25:] + cfg.speed * rng.normal(size=(n, 12))
-    tau = log.tau + cfg.torque * rng.normal(size=(n, 12))
-    scale = 1.0 + rng.uniform(-cfg.scale, cfg.scale, 4)
-    force = scale * log.force + walk(cfg.offset, cfg.drift, 4) + cfg.force * rng.normal(size=(n, 4))
-    force = np.rint(np.maximum(force, 0.0))
-
-    row = _arrivals(n, cfg, rng)
-    parts = [part[row] for part in (gyro, acc, q, qd, tau, force)]
+    row = _arrivals(len(log.t), cfg, rng)
+    parts = np.split(np.array(rows)[row], [3, 6, 18, 30, 42], axis=1)
     for frame in np.flatnonzero(rng.random(len(row)) < cfg.nan):
         parts[rng.integers(len(parts))][frame] = np.nan
     gyro, acc, q, qd, tau, force = parts
+    gyro_bias, acc_bias = np.split(np.array(biases), 2, axis=1)
     return Readings(row, log.t[row], gyro, acc, q, qd, tau, force, gyro_bias, acc_bias)
 
 

@@ -20,7 +20,7 @@ from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.go2.task import flip_task, policy_path
 from hmc.modes import Mode
 from tools.closed_loop import RunCfg, disturbed_start
-from tools.robot.body import stick
+from tools.robot.body import Body, stick
 
 ROOT = Path(__file__).resolve().parents[2]
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ class BodyCfg:
         friction: of the feet, least and most.
     """
 
-    link: float = 0.002
+    link: float = Body.length
     friction: tuple[float, float] = (0.4, 1.0)
 
 

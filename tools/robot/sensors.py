@@ -57,12 +57,16 @@ CLEAN = Sensors(**{name: 0.0 for name in Sensors.__dataclass_fields__ if name !=
 
 
 class Imu:
-    """Angular velocity, specific force and attitude, with their errors."""
+    """Angular velocity, specific force and attitude, with their errors.
+
+    Attributes:
+        gyro_bias, acc_bias: of the last reading [rad/s], [m/s^2], (3,); truth, for judging only.
+    """
 
     def __init__(self, cfg: Sensors, rng: np.random.Generator):
         self._cfg, self._rng = cfg, rng
-        self._gyro_bias = rng.uniform(-cfg.gyro_bias, cfg.gyro_bias, 3)
-        self._acc_bias = rng.uniform(-cfg.acc_bias, cfg.acc_bias, 3)
+        self.gyro_bias = rng.uniform(-cfg.gyro_bias, cfg.gyro_bias, 3)
+        self.acc_bias = rng.uniform(-cfg.acc_bias, cfg.acc_bias, 3)
         self._yaw_drift = rng.uniform(-cfg.yaw_drift, cfg.yaw_drift)
         self._next = 0.0
         self._last: tuple[Floats, Floats, Floats] | None = None
@@ -73,8 +77,8 @@ class Imu:
         """What it tells of the truth, dt [s] after the last call: (4,), (3,), (3,)."""
         cfg, rng = self._cfg, self._rng
         walk = rng.normal(size=(2, 3)) * math.sqrt(dt)
-        self._gyro_bias = self._gyro_bias + cfg.gyro_walk * walk[0]
-        self._acc_bias = self._acc_bias + cfg.acc_walk * walk[1]
+        self.gyro_bias = self.gyro_bias + cfg.gyro_walk * walk[0]
+        self.acc_bias = self.acc_bias + cfg.acc_walk * walk[1]
         noise = rng.normal(size=(2, 3))
         if self._last is not None and time < self._next - 1e-9:
             return self._last
@@ -84,8 +88,8 @@ class Imu:
         mujoco.mju_mulQuat(turned, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), quat)
         self._last = (
             turned,
-            gyro + self._gyro_bias + cfg.gyro * noise[0],
-            acc + self._acc_bias + cfg.acc * noise[1],
+            gyro + self.gyro_bias + cfg.gyro * noise[0],
+            acc + self.acc_bias + cfg.acc * noise[1],
         )
         return self._last
 
