@@ -15,6 +15,7 @@ from tests.tiny import CFG, make_env, make_runner
 from tools.bench import main
 from tools.benchmarks import learning
 from tools.benchmarks.engine import Engine
+from tools.benchmarks.estimator import Estimator
 from tools.benchmarks.figures import AT_LEAST, AT_MOST, Common, Figures
 from tools.benchmarks.gpu import Gpu
 from tools.benchmarks.growth import Growth
@@ -79,6 +80,10 @@ SMALL = {
     "wire": (
         Wire(threads=1, repeats=20, messages=20),
         {"crc_us", "state_decode_us", "robot_share", "round_trip_ms_p50", "answered"},
+    ),
+    "estimator": (
+        Estimator(threads=1, seconds=1.0, repeats=1),
+        {"estimator_step_us", "estimator_ahead_us", "estimator_step_four_us", "estimator_ahead_four_us"},
     ),
 }
 

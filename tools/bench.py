@@ -1,4 +1,4 @@
-"""How fast it is: `python tools/bench.py engine|train|planner|wire|growth|gpu [--json FILE]`.
+"""How fast it is: `python tools/bench.py engine|train|planner|wire|estimator|growth|gpu [--json FILE]`.
 
 Ratios are taken between two ways of doing the same work that take turns within one run, so that they mean
 something on a busy machine too; rates a second do only on an idle one. Where our work is compared with the
@@ -19,6 +19,7 @@ from rich.console import Console
 
 from hmc.cli import command_line
 from tools.benchmarks.engine import Engine, engine
+from tools.benchmarks.estimator import Estimator, estimator
 from tools.benchmarks.figures import NOT_MEASURED, cores, machine
 from tools.benchmarks.gpu import Gpu, gpu
 from tools.benchmarks.growth import Growth, growth
@@ -28,7 +29,7 @@ from tools.benchmarks.wire import Wire, wire
 from tools.study import write_json
 
 
-def main(args: Engine | Train | Planner | Wire | Growth | Gpu) -> int:
+def main(args: Engine | Train | Planner | Wire | Estimator | Growth | Gpu) -> int:
     """Measure, print, write."""
     threads = args.threads or cores()
     args = replace(args, threads=threads)
@@ -46,6 +47,8 @@ def main(args: Engine | Train | Planner | Wire | Growth | Gpu) -> int:
             figures = planner(args)
         case Wire():
             figures = wire(args)
+        case Estimator():
+            figures = estimator(args)
         case Growth():
             figures = growth(args)
         case Gpu():
@@ -64,4 +67,4 @@ def main(args: Engine | Train | Planner | Wire | Growth | Gpu) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(command_line(Engine | Train | Planner | Wire | Growth | Gpu)))
+    sys.exit(main(command_line(Engine | Train | Planner | Wire | Estimator | Growth | Gpu)))

@@ -36,6 +36,8 @@ AT_MOST = {
     "pruned_time_fraction": 0.12,
     "mppi_overhead": 1.10,
     "crc_us": 5.0,
+    "estimator_step_us": 400.0,
+    "estimator_step_four_us": 400.0,
     "exact_t75_ms": 250.0,
     "mppi_4096x40_ms": 40.0,
 }
