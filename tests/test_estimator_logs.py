@@ -106,7 +106,7 @@ def test_a_fall_is_noticed_and_the_robot_found_again_where_it_lies(seed):
 
 def test_the_sensors_are_the_stand_ins():
     """What a log's readings are off by is what the stand-in robot's settings say."""
-    log, cfg = simulate("stand", 4.0, 0), SensorCfg(drop=0.0, twice=0.0, nan=0.0, stall=0.0)
+    log, cfg = simulate("stand", 2.0, 0), SensorCfg(drop=0.0, twice=0.0, nan=0.0, stall=0.0)
     assert (cfg.robot, cfg.zero) == (Settings().sensors, Settings().body.zero)
     readings, robot = sense(log, 0, cfg), cfg.robot
     for told, true, size in (
