@@ -17,8 +17,10 @@ _WRAP = 2**32
 _LOOK = 0.01  # s between two looks for frames, at most, while the machine does not stand still
 _RESTART = 1000  # ms that the robot's clock may seem to go back before the robot has restarted
 # numbers of a state, in order, and where each ends among all
-_NAMES = ("attitude", "gyroscope", "accelerometer", "joints", "joint speeds", "torques")
-_ENDS = np.cumsum((4, 3, 3, 12, 12, 12))
+_NAMES = ("attitude", "angles", "gyroscope", "accelerometer", "joints", "joint speeds", "torques")
+_SIZES = (4, 3, 3, 3, 12, 12, 12)
+_ENDS = np.cumsum(_SIZES)
+_TURN = 2 * math.pi  # rad, more than an angle of roll, pitch and yaw has
 
 
 class StateChecks:
@@ -39,13 +41,16 @@ class StateChecks:
         self._silence = Silence(cfg.max_age, cfg.stall, _LOOK)
         self._fault = ""
         self._last = ""
+        self._imu, self._moved = b"", 0  # its last readings, and ms of the first frame with them
         self._remote: int | None = None  # ms of the last frame with a remote, or of the first frame
         margin = (UPPER - LOWER) / 2 + cfg.joint_margin
         speed, torque = np.full(12, cfg.joint_speed), np.full(12, cfg.torque)
-        widths = (np.full(4, 1.1), np.full(3, cfg.gyro), np.full(3, cfg.acc), margin, speed, torque)
-        self._width = np.concatenate(widths)
+        angles = np.full(4, 1.1), np.full(3, _TURN)
+        self._width = np.concatenate(
+            (*angles, np.full(3, cfg.gyro), np.full(3, cfg.acc), margin, speed, torque)
+        )
         self._middle = np.zeros(len(self._width))
-        self._middle[10:22] = (UPPER + LOWER) / 2
+        self._middle[13:25] = (UPPER + LOWER) / 2
 
     @property
     def heard(self) -> float:
@@ -73,6 +78,11 @@ class StateChecks:
         self._silence.hear(now)
         if state.remote != ABSENT or self._remote is None:
             self._remote = self.ms
+        imu = state.gyro.tobytes() + state.acc.tobytes()
+        if imu != self._imu:
+            self._imu, self._moved = imu, self.ms
+        elif self.ms - self._moved > 1000 * self.cfg.frozen:
+            self._fault = f"the IMU has told the same for {self.ms - self._moved} ms: is it broken?"
         if (hottest := int(state.temperature.max())) > self.cfg.temperature:
             self._fault = f"a motor has {hottest} deg C, allowed are {self.cfg.temperature:g}: let it cool"
         return state
@@ -103,7 +113,7 @@ class StateChecks:
     def _range(self, state: RobotState) -> str:
         """What of a frame cannot be; comparisons are written so that NaN fails them."""
         # one comparison for all numbers: most frames are good, and what is wrong can be found out afterwards
-        numbers = np.concatenate((state.quat, state.gyro, state.acc, state.q, state.dq, state.tau))
+        numbers = np.concatenate((state.quat, state.rpy, state.gyro, state.acc, state.q, state.dq, state.tau))
         fits = np.abs(numbers - self._middle) <= self._width
         if fits.all() and 0.9 < float(state.quat @ state.quat) < 1.1:
             return ""

@@ -220,9 +220,11 @@ class Control:
     def _posed(self) -> bool:
         if self._ramp is None or self.state is None or self._ramping < self._ramp.seconds:
             return False
-        if self.phase != Phase.STAND:  # a robot on its belly may not be able to fold its legs further
+        if self.phase == Phase.LIE:  # a robot on its belly may not be able to fold its legs further
             return True
         off = float(np.abs(self.state.q - np.tile(self._ramp.pose, 4)).max())
+        if self.phase != Phase.STAND:
+            return off < _ARRIVED
         if off < _ARRIVED:
             if not self._anew:  # the belly is no foothold: heights are known from here on
                 self._anew = True

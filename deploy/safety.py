@@ -10,6 +10,7 @@ lie      folds its legs, lies         stand, once it lies   damping         damp
 stand    rises on four legs, then     -                     lie             damping
          goes on to ready by itself
 ready    stands on four legs          hybrid, if planned    lie             damping
+                                      and in its pose
 hybrid   runs the modes of the plan   asks for the          damping         damping
                                       handstand
 damping  resists motion, for good     -                     -               -
@@ -53,7 +54,7 @@ class Inputs:
     Attributes:
         buttons: pressed on the remote; None: unknown, as no frame came that is believed.
         fault: what is wrong; "" for nothing.
-        posed: whether the phase's slow motion has come to its end.
+        posed: whether the phase's slow motion has come to its end, and the joints with it.
         settled: whether the estimator knows the state.
         planner: whether the planner has been heard of.
     """
@@ -121,8 +122,12 @@ class Machine:
             self.hint = "" if inputs.posed else "the robot does not lie yet"
             self.phase = Phase.STAND if inputs.posed else self.phase
         elif self.phase == Phase.READY:
-            self.hint = "" if inputs.planner else "the planner has not started yet"
-            self.phase = Phase.HYBRID if inputs.planner else self.phase
+            if not inputs.planner:
+                self.hint = "the planner has not started yet"
+            elif not inputs.posed:
+                self.hint = "a joint is not where it should be"
+            else:
+                self.phase = Phase.HYBRID
         elif self.phase == Phase.HYBRID:
             self.asked = True
         else:

@@ -20,6 +20,7 @@ class InputCfg:
         torque: largest reading [N m].
         temperature: of a motor, at most [deg C].
         min_charge: of the battery, to start with [%].
+        frozen: time in which the IMU may tell the same to the last bit [s]; no noise does.
         remote: time without the remote after which the robot is damped [s]: its L2 and B end everything.
     """
 
@@ -32,6 +33,7 @@ class InputCfg:
     torque: float = 90.0
     temperature: float = 85.0
     min_charge: int = 20
+    frozen: float = 0.04
     remote: float = 3.0
 
 

@@ -25,7 +25,7 @@ from deploy.messages import LowCmd_
 from deploy.process import Job, spawn
 from deploy.settings import WatchdogCfg
 from deploy.slots import Board, said
-from deploy.watchdog import Watchdog
+from deploy.watchdog import Process, Watchdog
 
 ROOT = Path(__file__).parent.parent
 DOMAIN = 10 + os.getpid() % 100
@@ -79,6 +79,28 @@ def test_a_pause_of_the_whole_machine_is_no_hang(board):
     beat(board, 2.0)
     assert not looks(it, 2.0, 2.02)
     assert looks(it, 2.10, 2.16), "after the pause it hung"
+
+
+def test_a_process_ends_when_it_is_killed_and_not_by_its_name():
+    code = "import ctypes, time; ctypes.CDLL(None).prctl(15, b'x) Z 4 4 4 4 4'); print(flush=True)"
+    with subprocess.Popen(
+        [sys.executable, "-c", f"{code}; time.sleep(60)"], stdout=subprocess.PIPE
+    ) as victim:
+        assert victim.stdout is not None
+        victim.stdout.readline()
+        it = Process(victim.pid)
+        assert not it.ends
+        victim.kill()
+        until = time.monotonic() + 5.0
+        while not it.ends and time.monotonic() < until:
+            time.sleep(0.001)
+        assert it.ends
+        victim.wait()
+        assert it.ends
+        it.close()
+        late = Process(victim.pid)
+        assert late.ends
+        late.close()
 
 
 @contextmanager

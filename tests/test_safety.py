@@ -113,6 +113,9 @@ def test_what_is_held_while_nothing_is_known_is_not_pressed_again():
     [(Phase.LIE, "does not lie"), (Phase.STAND, "not ready"), (Phase.READY, "planner has not started")],
 )
 def test_a_press_that_does_nothing_says_why(phase, hint):
+    it = machine(Phase.READY)
+    assert it.step(Inputs(Button.START, planner=True)) == Phase.READY
+    assert "a joint is not where it should be" in it.hint
     it = machine(phase)
     assert it.step(Inputs(Button.START)) == phase
     assert hint in it.hint
@@ -213,7 +216,8 @@ def test_a_target_that_is_no_number_is_named():
 def good(tick: int) -> bytes:
     """A frame that is believed."""
     told = state()._replace(tick=tick, q=np.array(facts.HOME), temperature=np.full(12, 30))
-    return encode_state(told._replace(quat=np.array([1.0, 0.0, 0.0, 0.0])))
+    noise = np.array([0.001 * (tick % 97), 0.0, 0.0])
+    return encode_state(told._replace(quat=np.array([1.0, 0.0, 0.0, 0.0]), gyro=noise))
 
 
 def changed(tick: int, **fields: object) -> bytes:
@@ -227,6 +231,7 @@ BAD = {
     "no LowState frame": lambda tick: good(tick)[:-1],
     "not a number": lambda tick: changed(tick, acc=np.array([0.0, np.nan, 0.0])),
     "range of the attitude": lambda tick: changed(tick, quat=np.zeros(4)),
+    "range of the angles": lambda tick: changed(tick, rpy=np.array([7.0, 0.0, 0.0])),
     "range of the gyroscope": lambda tick: changed(tick, gyro=np.array([0.0, -40.0, 0.0])),
     "range of the accelerometer": lambda tick: changed(tick, acc=np.array([200.0, 0.0, 0.0])),
     "range of the joints": lambda tick: changed(tick, q=np.array(facts.Q_UPPER) + 0.5),
@@ -290,6 +295,21 @@ def test_a_remote_that_is_gone_is_a_fault_until_it_is_back():
         assert checks.fault(1.0).startswith("no remote for 3.0 s")
         assert checks.take(good(3104), 1.0) is not None
         assert checks.fault(1.0) == ""
+
+
+def test_an_imu_that_tells_the_same_is_a_fault():
+    """Exactly the same: a robot that lies still has noise."""
+    checks = StateChecks(InputCfg(frozen=0.04))
+    same = {"gyro": np.full(3, 0.01), "acc": np.array([0.0, 0.0, 9.8])}
+    for tick in range(100, 142, 2):
+        assert checks.take(changed(tick, **same), 1.0) is not None
+        assert checks.fault(1.0) == ""
+    assert checks.take(changed(142, **{**same, "acc": np.array([0.0, 0.0, 9.81])}), 1.0) is not None
+    for tick in range(144, 186, 2):
+        assert checks.take(changed(tick, **same), 1.0) is not None
+        assert checks.fault(1.0) == ""
+    checks.take(changed(186, **same), 1.0)
+    assert checks.fault(1.0).startswith("the IMU has told the same for 42 ms")
 
 
 def test_a_hot_motor_is_a_fault():
