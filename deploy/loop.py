@@ -194,10 +194,11 @@ class Loop:
             self._silent = True  # the watchdog damps the robot by now, and two must not command
             control.fail(said(guard["reason"].item()))
         if not self._dry_run:
-            control.wait = "the watchdog has not started yet" if guard is None else ""
-            if guard is not None and float(guard["t"]) != self._guard.heard:
-                self._guard.hear(float(guard["t"]))
-            if guard is not None and self._guard.too_long(now):
+            looked = 0.0 if guard is None else float(guard["t"])
+            control.wait = "" if looked > 0 else "the watchdog has not started yet"
+            if looked > 0 and looked != self._guard.heard:
+                self._guard.hear(looked)
+            if looked > 0 and self._guard.too_long(now):
                 control.fail("the watchdog does not live any more")
         told = board.plan.read() if control.phase == Phase.READY else None
         control.planner = told is not None and now - float(told["t"]) < _PRESENCE

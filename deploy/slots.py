@@ -22,6 +22,7 @@ COUNTS = 320  # octets of counts in words
 # Times are those of the monotonic clock, which all processes of a machine share [s]; ticks are control steps
 # since the control process started.
 HEART = np.dtype(
+    # of the watchdog's the time is 0 until it has begun to look
     [("t", "f8"), ("pid", "i8"), ("commanding", "u1"), ("latched", "u1"), ("reason", f"S{TEXT}")]
 )
 STATE = np.dtype(

@@ -81,6 +81,7 @@ class Watchdog:
         self.reason = ""
         self._board = board
         self._silence = Silence(cfg.hang, cfg.stall, 2 * cfg.period)
+        self._say(0.0)  # whose publisher it is that others are going to see
 
     def look(self, gone: bool, now: float) -> bool:
         """Whether the robot is to be damped.
@@ -98,11 +99,15 @@ class Watchdog:
                 self.reason = "the control process ended"
             elif self._silence.too_long(now):
                 self.reason = f"the control process hung for {1e3 * (now - self._silence.heard):.0f} ms"
+        self._say(now)
+        return bool(self.reason)
+
+    def _say(self, now: float) -> None:
+        """Tell the control process that it looks, and what it has found."""
         guard = self._board.guard.blank()
         guard["t"], guard["pid"] = now, os.getpid()
         guard["latched"], guard["reason"] = bool(self.reason), text(self.reason)
         self._board.guard.write(guard)
-        return bool(self.reason)
 
 
 def watch(
@@ -139,8 +144,8 @@ def main(job: Job) -> None:
     stopped = until_told(parent_matters=False)
     cfg = load(job.cfg, DeployCfg, job.set)
     real_time(PRIORITY, job.real_time)
-    publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
     watchdog = Watchdog(Board(job.board), cfg.watchdog)
+    publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
     period, after = cfg.watchdog.period, cfg.watchdog.after
     watch(watchdog, job.pid, publisher, damping(cfg.output.damping), period, stopped, after)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from unittest import mock
@@ -15,7 +16,9 @@ from deploy.log import Recorder
 from deploy.loop import Loop
 from deploy.remote import Button, Remote, pack
 from deploy.safety import Phase
+from deploy.settings import WatchdogCfg
 from deploy.slots import Board, Slot, text
+from deploy.watchdog import Watchdog
 from tests.test_deploy_control import Met, duplicate, met
 
 __all__ = ["met"]  # a fixture
@@ -208,6 +211,28 @@ def test_another_program_that_commands_is_found_within_100_ms(hybrid: Turns):
         hybrid.turn()
     assert hybrid.control.machine.reason.startswith("another program commands the motors: another")
     assert time.monotonic() - began < 0.1
+
+
+def test_a_watchdog_that_is_starting_is_no_other_program(met: Met):
+    """Others see its publisher before it looks for the first time."""
+    turns = Turns(met, Phase.PASSIVE)
+    ours: list[int] = []
+    Watchdog(turns.board, WatchdogCfg())
+
+    def rivals(topic: str, known: tuple[int, ...] = ()) -> list[str]:
+        ours.extend(known)
+        return []
+
+    with mock.patch.object(turns.wire, "rivals", rivals):
+        time.sleep(0.1)
+        for _ in range(20):
+            turns.turn(guarded=False)
+    assert os.getpid() in ours
+    assert turns.control.wait == "the watchdog has not started yet"
+    assert turns.control.checks.fault(time.monotonic()) == turns.control._fault == ""
+    turns.turn()
+    assert turns.control.wait == ""
+    turns.board.close()
 
 
 def test_a_planner_that_is_silent_is_told_of_and_the_stance_goes_on(hybrid: Turns):
