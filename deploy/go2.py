@@ -52,7 +52,7 @@ class Args:
         release: let the robot's own controller be stopped; its legs give way: lay it down before.
         out: folder for the log and the summary.
         seed: of the stand-in and of the planner's draws.
-        robot: further arguments of tools/go2_robot.py, such as "--robot.state-delay 0.002".
+        robot: settings of the stand-in, see tools/go2_robot.py, such as state-delay=0.002 states.drop=0.01.
         foot: policy file of the foot stand; default: the one that comes with the package.
         hand: policy file of the handstand, likewise.
         set: overrides of cfg/deploy.toml, such as plan.lead=100.
@@ -71,7 +71,7 @@ class Args:
     release: bool = False
     out: Path = ROOT / "out" / "deploy"
     seed: int = 0
-    robot: str = ""
+    robot: tuple[str, ...] = ()
     foot: str = ""
     hand: str = ""
     set: tuple[str, ...] = ()
@@ -87,6 +87,17 @@ class Args:
     def simulated(self) -> bool:
         """Whether the robot is the stand-in."""
         return self.interface == LOOPBACK
+
+    @property
+    def stand_in(self) -> list[str]:
+        """What tools/go2_robot.py is told; ValueError for settings without a value."""
+        told = ["--speed", str(self.speed), "--robot.start", "lying", "--robot.seed", str(self.seed)]
+        for setting in self.robot:
+            name, equals, value = setting.partition("=")
+            if not equals:
+                raise ValueError(f"--robot takes settings such as state-delay=0.002, got {setting!r}")
+            told += [f"--robot.{name}", value]
+        return told
 
     def job(self) -> Job:
         """What every process is told."""
@@ -121,9 +132,8 @@ class Ended(RuntimeError):
 @contextlib.contextmanager
 def stand_in(args: Args, domain: int) -> Iterator[Port]:
     """The stand-in as a process, lying; its truth goes to truth.npz when it ends."""
-    command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--robot.start", "lying"]
-    command += ["--robot.seed", str(args.seed), "--log", str(args.out / "truth.npz")]
-    command += ["--speed", str(args.speed), "--parent", str(os.getpid()), *args.robot.split()]
+    command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--parent", str(os.getpid())]
+    command += ["--log", str((args.out / "truth.npz").absolute()), *args.stand_in]
     # a session of its own: Ctrl-C is ours to pass on, when the robot has been damped
     process = subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -241,6 +251,7 @@ def main(args: Args) -> int:
     with one_line_errors():
         load(args.job().cfg, DeployCfg, args.set)
         policies(args.foot, args.hand)
+        _ = args.stand_in  # what is wrong with it, said before anything is started
         if not 0 < args.speed <= 1 or (args.speed != 1 and not args.simulated):
             raise ValueError(
                 f"speed is above 0 and at most 1 on the stand-in, 1 on a robot; got {args.speed:g}"

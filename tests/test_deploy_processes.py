@@ -20,12 +20,15 @@ pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e
 
 from deploy.codec import decode_command
 from deploy.dds import Link, Subscriber
+from deploy.go2 import Args
 from deploy.log import STATE, TICK, TICK_RECORD, LogError, Recorder, pipe, read
 from deploy.messages import LowCmd_
 from deploy.process import Job, spawn
 from deploy.settings import WatchdogCfg
 from deploy.slots import Board, said
 from deploy.watchdog import Process, Watchdog
+from hmc.cli import command_line
+from tools.robot.process import Args as StandInArgs
 
 ROOT = Path(__file__).parent.parent
 DOMAIN = 10 + os.getpid() % 100
@@ -212,6 +215,7 @@ def test_the_real_time_side_needs_neither_torch_nor_mujoco():
         (["--interface", "eth77"], "no network interface 'eth77'"),
         (["--set", "input.max_aeg=1"], "unknown key input.max_aeg; did you mean max_age?"),
         (["--foot", "none.onnx"], "policy none.onnx: no such file"),
+        (["--robot", "state-delay"], "--robot takes settings such as state-delay=0.002, got 'state-delay'"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, told, tmp_path):
@@ -225,6 +229,15 @@ def test_bad_input_is_one_line_and_status_2(arguments, told, tmp_path):
     assert ran.returncode == 2, ran.stderr
     assert told in ran.stderr
     assert ran.stderr.count("\n") == 1
+
+
+def test_the_stand_in_is_told_its_settings():
+    """By the command line itself, several times or at once."""
+    words = ["--robot", "states.drop=0.25", "loss=limp", "--seed", "3", "--robot", "state-delay=0.002"]
+    found = command_line(Args, words).stand_in
+    robot = command_line(StandInArgs, found).robot
+    assert (robot.seed, robot.start, robot.loss, robot.state_delay) == (3, "lying", "limp", 0.002)
+    assert robot.states.drop == 0.25
 
 
 class Run:
