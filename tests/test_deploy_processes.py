@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from deploy.settings import WatchdogCfg
 from deploy.slots import Board, said
 from deploy.watchdog import Process, Watchdog
 from hmc.cli import command_line
+from tests.test_deploy_kills import prompt
 from tools.robot.process import Args as StandInArgs
 
 ROOT = Path(__file__).parent.parent
@@ -308,17 +309,6 @@ def damped(program: Run, seconds: float) -> tuple[float, float]:
     return first, max(longest, time.monotonic() - last)
 
 
-@contextmanager
-def ahead_of_others() -> Iterator[None]:
-    """Real-time priority, if the kernel grants it: or the test's own wait for a core is measured."""
-    with suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(30))
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
 @pytest.mark.deploy
 def test_killed_in_the_foot_stand(program):
     """The watchdog damps at once, and until the robot lies."""
@@ -326,7 +316,7 @@ def test_killed_in_the_foot_stand(program):
     time.sleep(1.0)
     control = program.child("deploy.loop")
     program.commands.take()
-    with ahead_of_others():
+    with prompt():
         os.kill(control, signal.SIGKILL)
         killed = time.monotonic()
         first, gap = damped(program, 2.5)
@@ -344,7 +334,7 @@ def test_however_the_program_ends_the_robot_is_damped_until_it_lies(program, how
     if "planner" in how:
         os.kill(program.child("deploy.planner"), signal.SIGSTOP)
     program.commands.take()
-    with ahead_of_others():
+    with prompt():
         program.process.send_signal(signal.Signals[how.split(",")[0]])
         told = time.monotonic()
         first, gap = damped(program, 2.5)
