@@ -8,11 +8,13 @@ import os
 import random
 import re
 import subprocess
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hmc.cli import one_line_errors
 from tests.tiny import CFG, make_runner
@@ -47,7 +49,10 @@ def test_two_iterations(trained):
     names = {path.name for path in folder.iterdir()}
     assert {"latest.pt", "model_0.pt", "model_1.pt"} <= names
     assert not [name for name in names if "partial" in name]
-    assert any(name.startswith("events.out.tfevents") for name in names), "tensorboard"
+    (events,) = folder.glob("events.out.tfevents*")
+    assert not [thread for thread in threading.enumerate() if "_AsyncWriter" in type(thread).__name__]
+    log = EventAccumulator(str(events)).Reload()
+    assert [entry.step for entry in log.Scalars("Loss/learning_rate")] == [0, 1], "to the last iteration"
 
 
 def test_the_learning_rate_falls_at_the_end(tmp_path):

@@ -19,6 +19,7 @@ from rich.live import Live
 from rich.table import Table
 from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
 
 from hmc.sim.check import tell_overflow
 from train.env import Go2Env
@@ -57,6 +58,14 @@ class Runner(OnPolicyRunner):
         self.logger.log = self._log_quietly
         self.logger.process_env_step = self._take_down
         self._ended: list[Tensor] = []  # of each step: which episodes ended, returns, lengths, (3, worlds)
+
+    def learn(self, *args: Any, **kwargs: Any) -> None:
+        """Train as rsl-rl does. Whatever ends it, the log is whole then, and no thread of it writes on."""
+        try:
+            super().learn(*args, **kwargs)
+        finally:
+            if isinstance(self.logger.writer, SummaryWriter):  # rsl-rl stops those of its own kinds alone
+                self.logger.writer.close()
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
         if self.logger.disable_logs:  # another process of torchrun writes

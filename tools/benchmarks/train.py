@@ -75,8 +75,7 @@ def iterations(args: Train, cfg: TrainCfg, env: Go2Env) -> np.ndarray:
         spent[0] += time.perf_counter() - began
 
     sim.step = timed
-    # tensorboard's thread may still write while the folder is removed
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, redirect_stdout(StringIO()):
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
         meta = {"command": "tools/bench.py", "seed": "1", "config": "{}", "config_sha256": ""}
         runner = Runner(env, rsl_config(cfg.ppo), folder, str(env.device), meta)
         began = [0.0]
