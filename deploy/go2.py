@@ -25,6 +25,7 @@ from deploy.log import pipe  # noqa: E402
 from deploy.loop import policies  # noqa: E402
 from deploy.memory import Memory  # noqa: E402
 from deploy.process import ENVIRONMENT, Job, spawn  # noqa: E402
+from deploy.safety import Phase  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
 from deploy.timing import Stolen  # noqa: E402
@@ -223,7 +224,7 @@ def run(args: Args, console: Console, port: Port | None) -> Memory:
         if watch:
             pids["watchdog"] = watch[0].pid
         memory = Memory(pids)
-        follow(board, control, operator, stack.enter_context(View(console)), memory)
+        follow(board, control, planner, operator, stack.enter_context(View(console)), memory)
         if operator is None and not args.dry_run:
             console.print("the control process has ended, the watchdog damps the robot: Ctrl-C ends it")
             signal.pause()
@@ -231,9 +232,19 @@ def run(args: Args, console: Console, port: Port | None) -> Memory:
 
 
 def follow(
-    board: Board, control: subprocess.Popen[str], operator: Presser | None, view: View, memory: Memory
+    board: Board,
+    control: subprocess.Popen[str],
+    planner: subprocess.Popen[str],
+    operator: Presser | None,
+    view: View,
+    memory: Memory,
 ) -> None:
-    """Show the status until the control process ends, or the operator in simulation says that it is over."""
+    """Show the status until the control process ends, or the operator in simulation says that it is over.
+
+    Raises:
+        Ended: the planner could not start. A robot that moves already is left to its operator.
+    """
+    phase = Phase.PASSIVE
     while control.poll() is None:
         time.sleep(LOOK)
         memory.look()
@@ -241,6 +252,10 @@ def follow(
         if status is None:
             continue
         view.show(status)
+        phase = max(phase, Phase(int(status["phase"])))
+        waits = phase == Phase.PASSIVE if operator is None else phase < Phase.HYBRID
+        if waits and planner.poll():
+            raise Ended("the planner", planner.returncode)
         if operator is not None and operator.see(status):
             return
 
@@ -275,7 +290,8 @@ def main(args: Args) -> int:
             else:
                 memory = run(args, console, None)
     except Ended as ended:
-        # what was wrong, the process has said itself
+        if ended.status < 0:  # else the process has said itself what was wrong
+            print(f"error: {ended}: a signal, or no memory was left", file=sys.stderr)
         return 2 if ended.status == 2 else 1
     from deploy.summary import summarise, write  # loads torch: seconds that the start need not wait for
 

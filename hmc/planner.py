@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import reduce
 
 import numpy as np
 import torch
@@ -94,6 +95,14 @@ class Plan:
     def incumbent_cost(self) -> float:
         """J of `incumbent`."""
         return self.costs[0]
+
+    @property
+    def schedules(self) -> tuple[Schedule, ...]:
+        """The incumbent and what each of `steps` made of it: one for each of `costs`, `schedule` the last."""
+        made = [self.incumbent]
+        for switches, _ in self.steps:
+            made.append(reduce(Schedule.stitch, switches, made[-1]))
+        return tuple(made)
 
     @property
     def gains(self) -> dict[str, float]:

@@ -194,3 +194,17 @@ def test_a_second_stand_in(tmp_path: Path) -> None:
     line = refused(folder=tmp_path, domain=HERE)
     assert f"there is a robot in domain {HERE} on lo already: " in line
     del other
+
+
+@pytest.mark.deploy
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("--task-set=horizon=20", "planner: horizon must be more than the lead of 30 control steps"),
+        ("--search=search.draws=many", "planner: .*planner.toml: search.draws"),
+    ],
+)
+def test_a_planner_that_cannot_start(setting: str, told: str, tmp_path: Path) -> None:
+    """Beside the stand-in, whose operator would else ask for the first mode for ever."""
+    line = refused(setting, folder=tmp_path, domain=HERE)
+    assert re.match(told, line), line

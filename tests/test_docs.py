@@ -9,8 +9,9 @@ from typing import Any
 import torch
 
 import hmc
+from tools.figures import search
 from tools.random_policy import write_random_policy
-from tools.search_figure import draw, example
+from tools.search_figure import example
 
 
 def test_the_example_swings_up(tmp_path, capsys):
@@ -23,7 +24,7 @@ def test_the_example_swings_up(tmp_path, capsys):
     assert abs(float(end[1])) < 0.5, "and nearly at rest"
     assert set(plan.schedule.names) == {"pump", "balance"}
     assert "of 22,650 switches" in capsys.readouterr().out
-    draw(plan, tmp_path / "search.png")
+    search(tmp_path / "search.png", plan)
     assert (tmp_path / "search.png").stat().st_size > 5000
 
 

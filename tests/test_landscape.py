@@ -15,7 +15,8 @@ from hmc import Budget, Evaluator, Rules, Schedule, Switch, make_start, plan
 from hmc.tasks.cartpole import CartpoleCfg, cartpole
 from tests.toy import Bad, Damp, Push, slow_cost, toy_task
 from tools import landscape as shows
-from tools.landscape import Args, Landscape, draw, landscape, main, of_log, of_plan, parse, read, reason
+from tools.figures import search
+from tools.landscape import Args, Landscape, draw, landscape, main, of_log, parse, read, reason
 
 NAMES = ("foot", "jump", "hand")
 
@@ -114,14 +115,45 @@ def test_a_plan_step_by_step(tmp_path, capsys):
     task = cartpole(CartpoleCfg(horizon=12, num_modes=3, angle=1.0))
     budget = Budget(control_steps=4000)
     found = plan(task, [1.0, 0, 0, 0], schedule=[1] * 12, budget=budget)
-    assert of_plan(found, 0) == found.incumbent
-    assert of_plan(found, len(found.steps)) == found.schedule
-    assert str(of_plan(found, 1)) in said
+    assert str(found.schedules[1]) in said
+    assert (tmp_path / "new" / "c_plan.png").stat().st_size > 5000
     ((_, after), *_) = found.steps
     assert reason(found.incumbent_terms, after) in " ".join(said.split())
     with pytest.raises(SystemExit):
         main(replace(args, step=99))
     assert f"the plan has 0 to {len(found.steps)} accepted steps, got --step 99" in capsys.readouterr().err
+
+
+def test_how_a_plan_came_about(tmp_path, monkeypatch):
+    """A row a schedule, a bar a stretch of a mode in its colour; what a step overwrote is outlined."""
+    figures = []
+    monkeypatch.setattr("tools.figures.save", lambda figure, _: figures.append(figure))
+    found = plan(toy_task(8), [0.4, -0.2], seed=3, moves=2)
+    assert len(found.steps) > 1
+    search(tmp_path / "s.png", found)
+    axis = figures[0].axes[0]
+    boxes = [
+        (
+            round(box.get_y() + 0.5 * box.get_height()),
+            box.get_x(),
+            box.get_width(),
+            box.get_fill(),
+            box.get_fc(),
+        )
+        for box in axis.patches
+    ]
+    bars = [(row, start, width) for row, start, width, filled, _ in boxes if filled]
+    runs = [(row, run.start, run.duration) for row, made in enumerate(found.schedules) for run in made.runs()]
+    assert bars == runs
+    marks = [(row, start, width) for row, start, width, filled, _ in boxes if not filled]
+    steps = enumerate((switches for switches, _ in found.steps), 1)
+    assert marks == [(row, each.start, each.duration) for row, switches in steps for each in switches]
+    legend = axis.get_legend()
+    colors = [handle.get_facecolor() for handle in legend.legend_handles]
+    modes = [run.mode for made in found.schedules for run in made.runs()]
+    assert [color for *_, filled, color in boxes if filled] == [colors[mode] for mode in modes]
+    assert [text.get_text() for text in legend.get_texts()] == list(found.schedule.names)
+    assert [text.get_text() for text in axis.texts] == [f"{cost:.5g}" for cost in found.costs]
 
 
 def test_the_largest_fall_comes_first():

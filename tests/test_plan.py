@@ -55,9 +55,14 @@ def test_what_a_plan_says_is_true(x, incumbent, solver, samples, draws, seed, or
         stitched = stitched.stitch(switch)
     assert stitched == result.schedule
     step = result.incumbent
-    for (switches, terms), cost in zip(result.steps, result.costs[1:], strict=True):
+    assert result.schedules[0] == result.incumbent
+    assert result.schedules[-1] == result.schedule
+    for (switches, terms), cost, made in zip(
+        result.steps, result.costs[1:], result.schedules[1:], strict=True
+    ):
         for switch in switches:
             step = step.stitch(switch)
+        assert made == step
         assert slow_cost(task, step, x) == cost
         assert sum(terms.values()) == pytest.approx(cost, rel=1e-12)
     assert [switch for switches, _ in result.steps for switch in switches] == list(result.switches)

@@ -1,4 +1,4 @@
-"""Figures of a recorded run."""
+"""Figures of a recorded run, and of a search."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+
+from hmc import Plan
 
 COLORS = {
     "foot": "#4c9f70",
@@ -61,6 +63,34 @@ def timeline(
     shown = [name for name in COLORS if name in modes]
     handles = [Rectangle((0, 0), 1, 1, color=COLORS[name], alpha=0.35) for name in shown]
     axes[0].legend(handles, shown, loc="lower right", ncols=3, fontsize=8)
+    save(figure, path)
+
+
+def search(path: Path, plan: Plan) -> None:
+    """How a plan of any task came about: its schedule after each accepted step, one below the other.
+
+    The incumbent is on top, what a step overwrote is outlined.
+    """
+    schedules = plan.schedules
+    names = plan.schedule.names or tuple(map(str, range(1 + max(map(max, schedules)))))
+    scale = plt.get_cmap("viridis")(np.linspace(0.3, 0.95, len(names)))  # outlines are seen on all of these
+    colors = [COLORS.get(name, shade) for name, shade in zip(names, scale, strict=True)]
+    figure, axis = plt.subplots(figsize=(9, 0.28 * len(schedules) + 1.2), constrained_layout=True)
+    for row, (schedule, cost) in enumerate(zip(schedules, plan.costs, strict=True)):
+        for run in schedule.runs():
+            axis.barh(row, run.duration, left=run.start, color=colors[run.mode], height=0.7)
+        for switch in plan.steps[row - 1][0] if row > 0 else ():
+            box = (switch.start, row - 0.35), switch.duration, 0.7
+            axis.add_patch(Rectangle(*box, fill=False, linewidth=1.8, edgecolor="black"))
+        axis.text(1.01 * len(schedule), row, f"{cost:.5g}", va="center", fontsize=9)
+    axis.set_yticks(range(len(schedules)), ["incumbent", *map(str, range(1, len(schedules)))], fontsize=9)
+    axis.set_xlim(0, 1.08 * len(plan.schedule))
+    axis.set_ylim(len(schedules) - 0.4, -0.6)
+    axis.set_xlabel("control step; at the right: cost")
+    axis.set_ylabel("accepted steps")
+    handles = [Rectangle((0, 0), 1, 1, color=color) for color in colors]
+    axis.legend(handles, names, loc="lower left", bbox_to_anchor=(0, 1), ncols=len(names), fontsize=8)
+    axis.spines[["top", "right"]].set_visible(False)
     save(figure, path)
 
 

@@ -3,6 +3,7 @@
 `python tools/landscape.py out/flip/seed_0.json --step 60` rolls all of Omega out from that step's state and
 plan; `python tools/landscape.py --task cartpole --step 2` does so around a plan's schedule after two accepted
 steps. Either draws the cost over (start, duration) for each mode, and says which terms the best one lowers.
+Of a plan, also the schedule after each accepted step is drawn, as a timeline.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
 from hmc.tasks.cartpole import CartpoleCfg, cartpole, initial_state  # noqa: E402
 from tools.closed_loop import RunCfg  # noqa: E402
-from tools.figures import save  # noqa: E402
+from tools.figures import save, search  # noqa: E402
 
 BARRED, DIVERGED = "#222222", "#e0c341"
 
@@ -183,29 +184,21 @@ def of_log(args: Args) -> tuple[Task, Start, Schedule]:
     return task, start, schedule
 
 
-def of_plan(found: Plan, step: int) -> Schedule:
-    """A plan's schedule after so many of its accepted steps."""
-    if not 0 <= step <= len(found.steps):
-        raise ValueError(f"the plan has 0 to {len(found.steps)} accepted steps, got --step {step}")
-    schedule = found.incumbent
-    for switch in (each for switches, _ in found.steps[:step] for each in switches):
-        schedule = schedule.stitch(switch)
-    return schedule
-
-
-def of_cartpole(args: Args, console: Console) -> tuple[Task, Start, Schedule]:
-    """A plan of the cartpole made here, its steps told, and the schedule after some of them."""
+def of_cartpole(args: Args, console: Console) -> tuple[Task, Start, Plan]:
+    """A plan of the cartpole made here, its steps told."""
     cfg = override(CartpoleCfg(), args.set)
     task = cartpole(cfg)
     idle = [cfg.num_modes // 2] * cfg.horizon
     start = make_start(task, task.make_sim(1), initial_state(cfg))
     found = plan(task, start, schedule=idle, budget=Budget(control_steps=args.control_steps))
-    schedule, before = of_plan(found, args.step), found.incumbent_terms
+    if not 0 <= args.step < len(found.schedules):
+        raise ValueError(f"the plan has 0 to {len(found.steps)} accepted steps, got --step {args.step}")
+    before = found.incumbent_terms
     for number, ((switches, after), cost) in enumerate(zip(found.steps, found.costs[1:], strict=True), 1):
         what = ", ".join(f"{task.modes.names[s.mode]} from {s.start} for {s.duration}" for s in switches)
         console.print(f"{number:3}: {what}: cost {cost:.4g}: {reason(before, after)}", highlight=False)
         before = after
-    return task, start, schedule
+    return task, start, found
 
 
 @torch.no_grad()
@@ -214,7 +207,11 @@ def main(args: Args) -> None:
     console = Console()
     with one_line_errors():
         flip = args.task == "flip"
-        task, start, schedule = of_log(args) if flip else of_cartpole(args, console)
+        if flip:
+            task, start, schedule = of_log(args)
+        else:
+            task, start, made = of_cartpole(args, console)
+            schedule = made.schedules[args.step]
     sim = task.make_sim(args.worlds)
     with console.status("rolling out all switches"):
         found = landscape(task, Evaluator(task, sim, start), schedule)
@@ -227,12 +224,17 @@ def main(args: Args) -> None:
     if found.switch is not None:
         better = f"with the best switch {np.nanmin(found.costs):.2f}: {found.best}"
     draw(out, found, f"{schedule}: cost {found.cost:.2f}, {better}")
+    pictures = [out]
+    if not flip:
+        pictures.append(out.with_name(f"{out.stem}_plan{out.suffix}"))
+        search(pictures[-1], made)
     console.print(f"{schedule}\n{found.best}", highlight=False)
     for name, before in found.terms[0].items():
         console.print(f"{name:>12} {before:8.3f} -> {found.terms[1][name]:8.3f}", highlight=False)
     why = "no switch lowers the cost" if found.switch is None else f"why: {reason(*found.terms)}"
     console.print(why, highlight=False)
-    console.print(f"{out}")
+    for picture in pictures:
+        console.print(f"{picture}")
 
 
 if __name__ == "__main__":
