@@ -1,4 +1,13 @@
-"""Schedules that begin alike, as the branches of a tree: equal beginnings need one rollout only."""
+"""Schedules that begin alike, as the branches of a tree: equal beginnings need one rollout only.
+
+With the trunk 0 0 0 0 0, which is known already, three schedules of five steps:
+
+    a  0 0 1 0 0   is the trunk up to step 2, where it is born from it: 3 steps to roll out
+    b  0 0 1 1 0   is a up to step 3, where it becomes a world of its own, a copy of a's: 2 steps
+    c  0 0 0 0 2   is born from the trunk at step 4: 1 step
+
+Six steps in place of 15. Then row = [0, 1, 2], parent = [-1, 0, -1] and born = [0, 0, 0, 1, 2, 3, 3].
+"""
 
 from __future__ import annotations
 

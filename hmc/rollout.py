@@ -91,10 +91,11 @@ def roll(
 class _Rollout:
     """A tree of n branches being rolled out on E members; arguments as of `roll`.
 
-    `ids` are the branches that go on, ascending, `at` the worlds that these are in. What steps cost is found
-    out for several of them at a time: a call for few worlds takes as long as one for many. `watched` says
-    whether row 0 is to be recorded whatever the bound. All that is known of branches is in numpy, whose calls
-    take a fraction of the time of torch's.
+    `ids` are the branches that go on, ascending, `at` the worlds that these are in. `watched` says whether
+    row 0 is to be recorded whatever the bound. All that is known of branches is in numpy, quicker than torch.
+    A call for few worlds takes as long as one for many, so up to `at_once` steps are priced together, and
+    with `later` their states and inputs judged only then; with `before_births` before children are born.
+    `watchful`: guards or bounds may end a branch on its way. `near`: to look at a number is no wait.
     """
 
     def __init__(self, worlds: Worlds, trunk: Traces, tree: Branches, bound: float, watched: bool):
