@@ -14,6 +14,7 @@ import torch
 from tests.tiny import CFG, make_env, make_runner
 from tools.bench import main
 from tools.benchmarks import learning
+from tools.benchmarks.deployed import Deployed
 from tools.benchmarks.engine import Engine
 from tools.benchmarks.estimator import Estimator
 from tools.benchmarks.figures import AT_LEAST, AT_MOST, Common, Figures
@@ -81,6 +82,10 @@ SMALL = {
         Wire(threads=1, repeats=20, messages=20),
         {"crc_us", "state_decode_us", "robot_share", "round_trip_ms_p50", "answered"},
     ),
+    "deployed": (
+        Deployed(threads=1, seconds=0.2, plans=1),
+        {"frame_share", "tick_us", *(f"plan_{name}_ms" for name in ("wait", "first", "search", "hand"))},
+    ),
     "estimator": (
         Estimator(threads=1, seconds=1.0, repeats=1),
         {"estimator_step_us", "estimator_ahead_us", "estimator_step_four_us", "estimator_ahead_four_us"},
@@ -90,7 +95,7 @@ SMALL = {
 
 @pytest.mark.parametrize("name", SMALL)
 def test_figures(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    if name == "wire":
+    if name in ("wire", "deployed"):
         pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
     if name == "gpu" and torch.cuda.is_available():
         pytest.skip("sizes for Warp's CPU device, and there is a GPU")

@@ -1,4 +1,4 @@
-"""How fast it is: `python tools/bench.py engine|train|planner|wire|estimator|growth|gpu [--json FILE]`.
+"""How fast it is: `python tools/bench.py NAME [--json FILE]`, NAME among those that `--help` lists.
 
 Ratios are taken between two ways of doing the same work that take turns within one run, so that they mean
 something on a busy machine too; rates a second do only on an idle one. Where our work is compared with the
@@ -18,6 +18,7 @@ import torch
 from rich.console import Console
 
 from hmc.cli import command_line
+from tools.benchmarks.deployed import Deployed, deployed
 from tools.benchmarks.engine import Engine, engine
 from tools.benchmarks.estimator import Estimator, estimator
 from tools.benchmarks.figures import NOT_MEASURED, cores, machine
@@ -29,12 +30,12 @@ from tools.benchmarks.wire import Wire, wire
 from tools.study import write_json
 
 
-def main(args: Engine | Train | Planner | Wire | Estimator | Growth | Gpu) -> int:
+def main(args: Engine | Train | Planner | Wire | Estimator | Deployed | Growth | Gpu) -> int:
     """Measure, print, write."""
     threads = args.threads or cores()
     args = replace(args, threads=threads)
     # searches run on one torch thread, see `plan`
-    torch.set_num_threads(1 if isinstance(args, Engine | Planner) else threads)
+    torch.set_num_threads(1 if isinstance(args, Engine | Planner | Deployed) else threads)
     torch.manual_seed(0)
     name = type(args).__name__.lower()
     host = machine(threads)
@@ -49,6 +50,8 @@ def main(args: Engine | Train | Planner | Wire | Estimator | Growth | Gpu) -> in
             figures = wire(args)
         case Estimator():
             figures = estimator(args)
+        case Deployed():
+            figures = deployed(args)
         case Growth():
             figures = growth(args)
         case Gpu():
@@ -67,4 +70,4 @@ def main(args: Engine | Train | Planner | Wire | Estimator | Growth | Gpu) -> in
 
 
 if __name__ == "__main__":
-    sys.exit(main(command_line(Engine | Train | Planner | Wire | Estimator | Growth | Gpu)))
+    sys.exit(main(command_line(Engine | Train | Planner | Wire | Estimator | Deployed | Growth | Gpu)))
