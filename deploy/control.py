@@ -205,7 +205,7 @@ class Control:
         assert self._ramp is not None
         part = min(1.0, self._ramping / self._ramp.seconds)
         w = 0.5 - 0.5 * math.cos(math.pi * part)
-        return (1.0 - w) * self._from + w * np.tile(self._ramp.pose, 4)
+        return (1.0 - w) * self._from + w * self._ramp.joints
 
     @property
     def _elapsed(self) -> float:
@@ -218,11 +218,13 @@ class Control:
         return 0.001 * (self.checks.ms - self._ramp_began)
 
     def _posed(self) -> bool:
-        if self._ramp is None or self.state is None or self._ramping < self._ramp.seconds:
+        if self._ramp is None or self.state is None or self.phase == Phase.HYBRID:
+            return False
+        if self._ramping < self._ramp.seconds:
             return False
         if self.phase == Phase.LIE:  # a robot on its belly may not be able to fold its legs further
             return True
-        off = float(np.abs(self.state.q - np.tile(self._ramp.pose, 4)).max())
+        off = float(np.abs(self.state.q - self._ramp.joints).max())
         if self.phase != Phase.STAND:
             return off < _ARRIVED
         if off < _ARRIVED:

@@ -76,7 +76,7 @@ def preflight(link: Link, states: Subscriber, cfg: DeployCfg, release: bool, dry
     try:
         switcher = MotionSwitcher(link)
         if (name := switcher.active()) and release:
-            off = np.abs(told[-1].q - np.tile(cfg.lie.pose, 4))
+            off = np.abs(told[-1].q - cfg.lie.joints)
             if not off.max() <= FOLDED:
                 raise Refusal(
                     f"the robot does not lie: {facts.JOINTS[int(off.argmax())]} is {off.max():.1f} rad off "

@@ -170,7 +170,7 @@ def violations(cfg: EnvelopeCfg, body: Body, since: float) -> list[str]:
         if not value <= high:
             found.append(f"{what} is {value:.3g} {unit}, at most {high:g} allowed")
 
-    low, high = np.tile(cfg.joint_low, 4), np.tile(cfg.joint_high, 4)
+    low, high = cfg.joints
     if not (beyond := np.maximum(low - body.q, body.q - high)).max() <= 0.0:
         i = int(np.argmax(np.where(np.isnan(beyond), math.inf, beyond)))
         found.append(f"{facts.JOINTS[i]} is {body.q[i]:.3g} rad, {low[i]:g} to {high[i]:g} allowed")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,11 @@ class EnvelopeCfg:
     tilt_std: float = 10.0
     patience: float = 0.03
 
+    @cached_property
+    def joints(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """`joint_low` and `joint_high` of all joints, (12,) each."""
+        return np.tile(self.joint_low, 4), np.tile(self.joint_high, 4)
+
 
 @dataclass(frozen=True)
 class EnvelopesCfg:
@@ -98,6 +107,11 @@ class RampCfg:
     kp: float
     kd: float
     step: float = 0.1
+
+    @cached_property
+    def joints(self) -> NDArray[np.float64]:
+        """`pose` of all joints, (12,)."""
+        return np.tile(self.pose, 4)
 
 
 @dataclass(frozen=True)

@@ -201,7 +201,10 @@ def test_a_second_stand_in(tmp_path: Path) -> None:
     ("setting", "told"),
     [
         ("--task-set=horizon=20", "planner: horizon must be more than the lead of 30 control steps"),
-        ("--search=search.draws=many", "planner: .*planner.toml with search.draws=many: search.draws: expected int"),
+        (
+            "--search=search.draws=many",
+            "planner: .*planner.toml with search.draws=many: search.draws: expected int",
+        ),
     ],
 )
 def test_a_planner_that_cannot_start(setting: str, told: str, tmp_path: Path) -> None:
