@@ -30,7 +30,7 @@ from deploy.slots import Board
 from deploy.slots import said as told
 from hmc.go2.stances import FOOTSTAND
 
-pytestmark = pytest.mark.deploy
+pytestmark = [pytest.mark.deploy, pytest.mark.clock]
 
 DOMAIN = 10 + os.getpid() % 100
 QUICK = ("lie.seconds=0.4", "stand.seconds=0.8")

@@ -189,6 +189,7 @@ def test_who_stood_still_asks_the_watchdog_again_before_it_commands(hybrid: Turn
     assert hybrid.turn() == [], "the watchdog damps now, and two must not command"
 
 
+@pytest.mark.clock
 def test_a_watchdog_that_is_silent_is_found_within_100_ms(hybrid: Turns):
     hybrid.turn()
     began = time.monotonic()
@@ -200,6 +201,7 @@ def test_a_watchdog_that_is_silent_is_found_within_100_ms(hybrid: Turns):
     assert damps(sent[-1])
 
 
+@pytest.mark.clock
 def test_another_program_that_commands_is_found_within_100_ms(hybrid: Turns):
     for _ in range(5):
         hybrid.turn()

@@ -31,6 +31,8 @@ from hmc.cli import command_line
 from tests.test_deploy_kills import prompt
 from tools.robot.process import Args as StandInArgs
 
+pytestmark = pytest.mark.clock
+
 ROOT = Path(__file__).parent.parent
 DOMAIN = 10 + os.getpid() % 100
 SLEEPER = [sys.executable, "-c", "import time; time.sleep(60)"]

@@ -146,6 +146,18 @@ def test_the_mode(exported):
     assert ((action.numpy() >= LOWER) & (action.numpy() <= UPPER)).all()
 
 
+def test_a_world_that_diverges_is_no_warning(exported):
+    """Its state may be too large for the network's numbers; its neighbour is not touched by that."""
+    policy = Policy(exported)
+    x, k = HANDSTAND.state().expand(2, 37).clone(), torch.zeros(2, dtype=torch.long)
+    x[0, 25:] = 1e60
+    memory = policy.reset(x, x[:, 7:19], k)
+    u, _ = policy.act(x, x[:, 7:19], memory, k)
+    alone, _ = policy.act(x[1:], x[1:, 7:19], memory[1:], k[1:])
+    assert torch.equal(u[1:], alone)
+    assert not ((u[0] < torch.from_numpy(LOWER)) | (u[0] > torch.from_numpy(UPPER))).any()
+
+
 def test_metadata(exported, checkpoint):
     meta = Policy(exported).network.metadata
     assert {key: meta[key] for key in contract()} == contract()

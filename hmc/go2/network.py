@@ -136,7 +136,9 @@ class Network:
         if command is not None:
             obs[:, 3:5] = 0.0
             obs = np.concatenate([obs, command], 1)
-        target = self.pose + self.scale * self.run(obs.astype(np.float32)).astype(np.float64)
+        with np.errstate(over="ignore"):  # of a world that diverges
+            given = obs.astype(np.float32)
+        target = self.pose + self.scale * self.run(given).astype(np.float64)
         np.maximum(target, LOWER, out=target)
         np.minimum(target, UPPER, out=target)
         return target
