@@ -42,12 +42,10 @@ class ModelCfg:
     Attributes:
         name: in the table.
         set: overrides of cfg/flip.toml that make it.
-        trials: flips planned on it, at most; None for as many as on the others.
     """
 
     name: str
     set: tuple[str, ...] = ()
-    trials: int | None = None
 
 
 @dataclass(frozen=True)
@@ -102,12 +100,7 @@ class Row:
 
 def jobs(cfg: StudyCfg) -> list[Job]:
     """All of the study; a seed on all models before the next one, so that a study that is stopped is even."""
-    return [
-        Job(model.name, cfg.first_seed + i)
-        for i in range(cfg.trials)
-        for model in cfg.models
-        if model.trials is None or i < model.trials
-    ]
+    return [Job(model.name, cfg.first_seed + i) for i in range(cfg.trials) for model in cfg.models]
 
 
 def settings(cfg: StudyCfg, name: str) -> RunCfg:
@@ -213,8 +206,7 @@ def main(args: Args) -> int:
         cfg = study_cfg(ROOT / "cfg" / "planning_model.toml", StudyCfg, args.set)
         for model in cfg.models:
             settings(cfg, model.name)  # what is wrong with a key shows here
-        alike = replace(cfg, trials=0, models=tuple(replace(model, trials=None) for model in cfg.models))
-        folder = study.folder_of(args.out, alike, args.resume)  # more trials come on top
+        folder = study.folder_of(args.out, replace(cfg, trials=0), args.resume)  # more trials come on top
     console = Console()
     known = folder / "speed.json"
     if not known.exists():
