@@ -218,9 +218,7 @@ class Control:
         return 0.001 * (self.checks.ms - self._ramp_began)
 
     def _posed(self) -> bool:
-        if self._ramp is None or self.state is None or self.phase == Phase.HYBRID:
-            return False
-        if self._ramping < self._ramp.seconds:
+        if self._ramp is None or self.state is None or self._ramping < self._ramp.seconds:
             return False
         if self.phase == Phase.LIE:  # a robot on its belly may not be able to fold its legs further
             return True

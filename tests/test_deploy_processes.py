@@ -31,8 +31,6 @@ from hmc.cli import command_line
 from tests.test_deploy_kills import prompt
 from tools.robot.process import Args as StandInArgs
 
-pytestmark = pytest.mark.clock
-
 ROOT = Path(__file__).parent.parent
 DOMAIN = 10 + os.getpid() % 100
 SLEEPER = [sys.executable, "-c", "import time; time.sleep(60)"]
@@ -141,6 +139,7 @@ def until_damped(commands: Subscriber) -> float:
     return first
 
 
+@pytest.mark.clock
 def test_a_killed_controller_is_followed_by_damping_within_20_ms(board):
     with watched(board) as (victim, commands):
         for _ in range(20):
@@ -153,6 +152,7 @@ def test_a_killed_controller_is_followed_by_damping_within_20_ms(board):
         assert until_damped(commands) - killed < 0.02
 
 
+@pytest.mark.clock
 def test_a_controller_that_hangs_is_damped_within_100_ms(board):
     with watched(board) as (_, commands):
         beat(board, stopped := time.monotonic())
@@ -311,6 +311,7 @@ def damped(program: Run, seconds: float) -> tuple[float, float]:
     return first, max(longest, time.monotonic() - last)
 
 
+@pytest.mark.clock
 @pytest.mark.deploy
 def test_killed_in_the_foot_stand(program):
     """The watchdog damps at once, and until the robot lies."""
@@ -327,6 +328,7 @@ def test_killed_in_the_foot_stand(program):
     program.end()
 
 
+@pytest.mark.clock
 @pytest.mark.deploy
 @pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGHUP", "SIGKILL", "SIGINT, planner stopped"])
 def test_however_the_program_ends_the_robot_is_damped_until_it_lies(program, how):

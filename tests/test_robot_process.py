@@ -32,8 +32,6 @@ from tools.robot.orders import obey
 from tools.robot.process import Args, Log, run
 from tools.robot.standin import Settings, StandIn, Truth, ideal
 
-pytestmark = pytest.mark.clock
-
 ROOT = Path(__file__).parent.parent
 DOMAIN = 120 + os.getpid() % 100  # not that of test_dds.py: a killed robot lingers
 STAND = encode_command(hold(go2.HOME.numpy().astype(np.float64), 60.0, 5.0))
