@@ -133,7 +133,10 @@ class Control:
         fault = self._fault or self.checks.fault(now) or self._outside(state)
         if self.phase == Phase.PASSIVE:
             fault = fault or self.wait
-        self._step(Inputs(unpack(state.remote).buttons, fault, self._posed(), self._settled(), self.planner))
+        phase = self.phase  # what a phase does not ask for is not looked at: this is done 500 times a second
+        posed = phase in (Phase.LIE, Phase.STAND, Phase.READY) and self._posed()
+        settled = phase == Phase.STAND and self._settled()
+        self._step(Inputs(unpack(state.remote).buttons, fault, posed, settled, self.planner))
 
     def idle(self, now: float) -> None:
         """No frame came that is believed."""

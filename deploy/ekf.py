@@ -64,6 +64,7 @@ Rows = Sequence[Sequence[float]]
 N = 30
 PHI, V, R, BW, BF = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 FEET, GIVE, LATE, SPIN = slice(15, 27), 27, 28, 29
+_SOLES = slice(FEET.start + 2, FEET.stop, 3)  # heights of the feet
 GRAVITY = 9.81
 _ARM = 0.4  # m, from the IMU to a foot
 _TINY = 1e-12
@@ -125,7 +126,7 @@ class Ekf:
         self._F, self._still = np.eye(N), np.eye(N)
         self._FP = np.empty((N, N))
         self._H: dict[tuple[int, ...], Array] = {}  # by the feet that an update takes
-        self._carry = np.zeros((N, 3))
+        self._carry, self._up = np.zeros((N, 3)), np.eye(N)[R.stop - 1]
         self._legs: tuple[int, ...] = ()
         self._e, self._PHt, self._S = np.empty(0), np.empty(0), np.empty(0)
 
@@ -207,8 +208,8 @@ class Ekf:
             doubt = self.cfg.sample * (1.0 - self.cfg.shock / size) * dt
             diagonal[V] += (doubt * (self.C @ change[3:])) ** 2
         # together they may rise by what no reading tells, so that velocity and tilt have no part in it
-        heights = [R.stop - 1, *(foot(leg).stop - 1 for leg in np.flatnonzero(self.stands).tolist())]
-        P[np.ix_(heights, heights)] += self.cfg.rise**2 * dt
+        self._up[_SOLES] = self.stands
+        P += (self.cfg.rise**2 * dt) * (self._up[:, None] * self._up)
         if jump is not None:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P

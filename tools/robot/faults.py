@@ -56,19 +56,15 @@ class Way:
         """Send frames; what arrives in this step, oldest first."""
         for frame in frames:
             # as many draws for every frame: one fault's probability does not change the others' pattern
-            drop, duplicate, late, corrupt, nan = self._rng.random(5) < (
-                self.faults.drop,
-                self.faults.duplicate,
-                self.faults.late,
-                self.faults.corrupt,
-                self.faults.nan,
-            )
-            if drop:
+            drop, duplicate, late, corrupt, nan = self._rng.random(5).tolist()
+            faults = self.faults
+            if drop < faults.drop:
                 continue
-            frame = self._not_a_number(frame) if nan else frame
-            frame = self._corrupted(frame) if corrupt else frame
-            due = self._now + self._delay + late * round(self.faults.stall / self._step)
-            self._going += [(due, frame)] * (1 + duplicate)
+            frame = self._not_a_number(frame) if nan < faults.nan else frame
+            frame = self._corrupted(frame) if corrupt < faults.corrupt else frame
+            stall = round(faults.stall / self._step) if late < faults.late else 0
+            times = 2 if duplicate < faults.duplicate else 1
+            self._going += [(self._now + self._delay + stall, frame)] * times
         arrived = [frame for due, frame in self._going if due <= self._now]
         self._going = [(due, frame) for due, frame in self._going if due > self._now]
         self._now += 1

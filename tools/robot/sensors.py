@@ -110,7 +110,7 @@ class Encoders:
         """What the encoders read at these joint angles [rad], (12,)."""
         read = q + self._zeros
         count = self._cfg.encoder
-        return count * np.round(read / count) if count else read
+        return count * np.rint(read / count) if count else read
 
     def told(self, q: Floats, dq: Floats, torque: Floats) -> tuple[Floats, Floats, Floats]:
         """Angles, speeds and torques as the motors tell them, (12,) each."""
@@ -136,7 +136,7 @@ class Feet:
         walk, noise = self._rng.normal(size=(2, 4))
         self._offset = self._offset + self._cfg.foot_drift * math.sqrt(dt) * walk
         counts = self._scale * force + self._offset + self._cfg.foot_noise * noise
-        counts = np.clip(np.round(counts), -(2**15), 2**15 - 1).astype(np.int64)
+        counts = np.minimum(np.maximum(np.rint(counts), -(2**15)), 2**15 - 1).astype(np.int64)
         for foot, value in self.stuck.items():
             counts[foot] = value
         return counts
