@@ -24,7 +24,7 @@ from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
 from deploy.log import pipe  # noqa: E402
 from deploy.loop import policies  # noqa: E402
 from deploy.memory import Memory  # noqa: E402
-from deploy.process import ENVIRONMENT, Job, spawn  # noqa: E402
+from deploy.process import ENVIRONMENT, Job, share_cores, spawn  # noqa: E402
 from deploy.safety import Phase  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
@@ -197,6 +197,9 @@ def run(args: Args, console: Console, port: Port | None) -> Memory:
     base = {**vars(job), "board": board.descriptor}
     with contextlib.ExitStack() as stack:
         stack.callback(board.close)
+        stack.callback(os.sched_setaffinity, 0, os.sched_getaffinity(0))
+        base["core"], others = share_cores()
+        os.sched_setaffinity(0, others)  # of the view, and of all who are started but the control process
         log = spawn("log", Job(**{**base, "log": source, "path": str(args.out / "run.mcap")}), [source])
         stack.callback(log.wait)  # it ends when the control process has
         os.close(source)

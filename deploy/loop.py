@@ -7,6 +7,7 @@ and a robot that damps itself when it hears nothing hears enough. Between ticks 
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -330,6 +331,8 @@ def run(job: Job, stopped: Callable[[], bool]) -> None:
 def main(job: Job) -> int:
     """Be the control process until SIGTERM; exit status 2 and one line if the robot cannot be started."""
     stopped = until_told()
+    if job.core is not None:
+        os.sched_setaffinity(0, {job.core})
     try:
         run(job, stopped)
     except (Refusal, LinkError, ValueError) as error:

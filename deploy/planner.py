@@ -319,8 +319,9 @@ def main(job: Job) -> int:
     if not allowed():
         os.nice(NICE)
     torch.set_num_threads(1)
+    cores = len(os.sched_getaffinity(0))  # the engine would have a thread for each core of the machine
     try:
-        planner = planner_of(job)
+        planner = planner_of(replace(job, threads=job.threads or cores))
     except ValueError as error:
         print(f"planner: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -46,6 +46,7 @@ class Job:
         threads: of the planner's engine; 0 for all cores.
         speed: of the robot's clock; not 1 in slow motion alone.
         real_time: ask the kernel for real-time priority.
+        core: of the control process; None for any.
     """
 
     board: int = -1
@@ -67,6 +68,7 @@ class Job:
     threads: int = 0
     speed: float = 1.0
     real_time: bool = True
+    core: int | None = None
 
 
 def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:
@@ -126,6 +128,17 @@ def real_time(priority: int, ask: bool = True) -> bool:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         return ask
     return False
+
+
+def share_cores() -> tuple[int | None, set[int]]:
+    """The control process's own core, and those of everybody else, of the cores that this process may use.
+
+    Who shares that core has to be driven from it at every state frame, and is not in time without real-time
+    priority. A single core is everybody's.
+    """
+    cores = os.sched_getaffinity(0)
+    own = max(cores) if len(cores) > 1 else None
+    return own, cores - {own}
 
 
 def allowed() -> bool:

@@ -143,9 +143,9 @@ def main(job: Job) -> None:
     """Be the watchdog until SIGTERM."""
     stopped = until_told(parent_matters=False)
     cfg = load(job.cfg, DeployCfg, job.set)
-    real_time(PRIORITY, job.real_time)
     watchdog = Watchdog(Board(job.board), cfg.watchdog)
     publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
+    real_time(PRIORITY, job.real_time)  # now only: making a link takes 70 ms of a core
     period, after = cfg.watchdog.period, cfg.watchdog.after
     watch(watchdog, job.pid, publisher, damping(cfg.output.damping), period, stopped, after)
 

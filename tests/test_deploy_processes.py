@@ -23,7 +23,7 @@ from deploy.dds import Link, Subscriber
 from deploy.go2 import Args
 from deploy.log import STATE, TICK, TICK_RECORD, LogError, Recorder, pipe, read
 from deploy.messages import LowCmd_
-from deploy.process import Job, spawn
+from deploy.process import Job, share_cores, spawn
 from deploy.settings import WatchdogCfg
 from deploy.slots import Board, said
 from deploy.watchdog import Process, Watchdog
@@ -105,6 +105,16 @@ def test_a_process_ends_when_it_is_killed_and_not_by_its_name():
         late = Process(victim.pid)
         assert late.ends
         late.close()
+
+
+def test_control_shares_its_core_with_nobody(monkeypatch):
+    def shared(cores: set[int]) -> tuple[int | None, set[int]]:
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(cores))
+        return share_cores()
+
+    assert shared({0, 1}) == (1, {0})
+    assert shared({2, 5, 7}) == (7, {2, 5})
+    assert shared({3}) == (None, {3})
 
 
 @contextmanager
@@ -354,6 +364,10 @@ def test_however_the_program_ends_the_robot_is_damped_until_it_lies(program, how
 @pytest.mark.deploy
 def test_the_foot_stand_goes_on_without_the_planner(program):
     program.until("hybrid foot")
+    control, planner = (os.sched_getaffinity(program.child(f"deploy.{name}")) for name in ("loop", "planner"))
+    if len(os.sched_getaffinity(0)) > 1:
+        assert len(control) == 1
+        assert not control & planner
     os.kill(program.child("deploy.planner"), signal.SIGKILL)
     time.sleep(5.0)
     program.process.send_signal(signal.SIGINT)
