@@ -199,7 +199,7 @@ def run(args: Args, console: Console, port: Port | None) -> Memory:
         stack.callback(board.close)
         stack.callback(os.sched_setaffinity, 0, os.sched_getaffinity(0))
         base["core"], others = share_cores()
-        os.sched_setaffinity(0, others)  # of the view, and of all who are started but the control process
+        os.sched_setaffinity(0, others)  # of the view, and of all who are started until they ask for more
         log = spawn("log", Job(**{**base, "log": source, "path": str(args.out / "run.mcap")}), [source])
         stack.callback(log.wait)  # it ends when the control process has
         os.close(source)

@@ -27,7 +27,7 @@ from hmc.planner import worlds_for
 from hmc.receding import SearchCfg
 from hmc.start import Start
 
-NICE = 5  # where what controls the robot may not have a real-time priority
+NICE = 5  # where what controls the robot has no real-time priority
 _KEPT = 40  # plans that the control process may still be running
 
 
@@ -316,7 +316,7 @@ def planner_of(job: Job) -> Planner:
 def main(job: Job) -> int:
     """Be the planner until SIGTERM; exit status 2 and one line if it is asked for what it cannot do."""
     stopped = until_told()
-    if not allowed():
+    if not (job.real_time and allowed()):
         os.nice(NICE)
     torch.set_num_threads(1)
     cores = len(os.sched_getaffinity(0))  # the engine would have a thread for each core of the machine

@@ -145,6 +145,8 @@ def main(job: Job) -> None:
     cfg = load(job.cfg, DeployCfg, job.set)
     watchdog = Watchdog(Board(job.board), cfg.watchdog)
     publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
+    if job.core is not None:  # nor does it wait for a planner where the control process leaves its core alone
+        os.sched_setaffinity(0, {*os.sched_getaffinity(0), job.core})
     real_time(PRIORITY, job.real_time)  # now only: making a link takes 70 ms of a core
     period, after = cfg.watchdog.period, cfg.watchdog.after
     watch(watchdog, job.pid, publisher, damping(cfg.output.damping), period, stopped, after)
