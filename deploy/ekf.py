@@ -123,8 +123,7 @@ class Ekf:
         # rotation of each shank since its foot touched down [rad], and the most of it, squared
         self._turned = [(0.0, 0.0, 0.0, 0.0)] * 4
         self.P = np.eye(N)
-        self._F, self._still = np.eye(N), np.eye(N)
-        self._FP = np.empty((N, N))
+        self._F, self._still, self._FP = np.eye(N), np.eye(N), np.empty((N, N))
         self._H: dict[tuple[int, ...], Array] = {}  # by the feet that an update takes
         self._carry, self._up = np.zeros((N, 3)), np.eye(N)[R.stop - 1]
         self._legs: tuple[int, ...] = ()

@@ -14,6 +14,7 @@ from deploy.codec import decode_command, decode_state, encode_state
 from deploy.control import TICK
 from deploy.log import Recorder
 from deploy.loop import Loop
+from deploy.process import share_cores
 from deploy.remote import Button, Remote, pack
 from deploy.safety import Phase
 from deploy.settings import WatchdogCfg
@@ -255,3 +256,13 @@ def test_a_dry_run_sends_nothing_and_the_watchdog_has_nothing_to_damp(met: Met):
     assert turns.control.phase == Phase.HYBRID
     assert not turns.told(turns.board.heart)["commanding"]
     turns.board.close()
+
+
+def test_control_shares_its_core_with_nobody(monkeypatch):
+    def shared(cores: set[int]) -> tuple[int | None, set[int]]:
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(cores))
+        return share_cores()
+
+    assert shared({0, 1}) == (1, {0})
+    assert shared({2, 5, 7}) == (7, {2, 5})
+    assert shared({3}) == (None, {3})

@@ -23,7 +23,7 @@ from deploy.dds import Link, Subscriber
 from deploy.go2 import Args
 from deploy.log import STATE, TICK, TICK_RECORD, LogError, Recorder, pipe, read
 from deploy.messages import LowCmd_
-from deploy.process import Job, share_cores, spawn
+from deploy.process import Job, spawn
 from deploy.settings import WatchdogCfg
 from deploy.slots import Board, said
 from deploy.watchdog import Process, Watchdog
@@ -105,16 +105,6 @@ def test_a_process_ends_when_it_is_killed_and_not_by_its_name():
         late = Process(victim.pid)
         assert late.ends
         late.close()
-
-
-def test_control_shares_its_core_with_nobody(monkeypatch):
-    def shared(cores: set[int]) -> tuple[int | None, set[int]]:
-        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(cores))
-        return share_cores()
-
-    assert shared({0, 1}) == (1, {0})
-    assert shared({2, 5, 7}) == (7, {2, 5})
-    assert shared({3}) == (None, {3})
 
 
 @contextmanager
