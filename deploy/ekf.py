@@ -125,7 +125,7 @@ class Ekf:
         self.P = np.eye(N)
         self._F, self._still, self._FP = np.eye(N), np.eye(N), np.empty((N, N))
         self._H: dict[tuple[int, ...], Array] = {}  # by the feet that an update takes
-        self._carry, self._up = np.zeros((N, 3)), np.eye(N)[R.stop - 1]
+        self._carry, self._heights = np.zeros((N, 3)), np.eye(N)[R.stop - 1]
         self._legs: tuple[int, ...] = ()
         self._e, self._PHt, self._S = np.empty(0), np.empty(0), np.empty(0)
 
@@ -207,8 +207,8 @@ class Ekf:
             doubt = self.cfg.sample * (1.0 - self.cfg.shock / size) * dt
             diagonal[V] += (doubt * (self.C @ change[3:])) ** 2
         # together they may rise by what no reading tells, so that velocity and tilt have no part in it
-        self._up[_SOLES] = self.stands
-        P += (self.cfg.rise**2 * dt) * (self._up[:, None] * self._up)
+        self._heights[_SOLES] = self.stands
+        P += (self.cfg.rise**2 * dt) * (self._heights[:, None] * self._heights)
         if jump is not None:
             diagonal[:6] += (0.5 * gap * jump) ** 2
         self.P = P

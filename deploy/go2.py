@@ -59,7 +59,7 @@ class Args:
         set: overrides of cfg/deploy.toml, such as plan.lead=100.
         task_set: overrides of the task in cfg/flip.toml, after those of cfg/planner.toml, such as substeps=2.
         search: overrides of cfg/planner.toml, such as search.draws=16.
-        threads: of the planner's engine; 0 for all cores.
+        threads: of the planner's engine; 0 for one a core that the planner may use.
         hold: of the foot stand before the handstand is asked for, on the stand-in [s].
         keys: the keyboard has the remote's buttons, and pushes; on the stand-in only.
         speed: of the stand-in's clock, for slow motion where the machine is busy; 1 on a robot.

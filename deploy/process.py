@@ -43,7 +43,7 @@ class Job:
         task_set: overrides of its table `task`.
         search: overrides of cfg/planner.toml.
         seed: of the planner.
-        threads: of the planner's engine; 0 for all cores.
+        threads: of the planner's engine; 0 for one a core that the planner may use.
         speed: of the robot's clock; not 1 in slow motion alone.
         real_time: ask the kernel for real-time priority.
         core: of the control process; None for any.
