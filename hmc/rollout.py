@@ -103,6 +103,7 @@ class _Rollout:
         self.worlds, self.sim, self.task, self.trunk, self.tree = worlds, worlds.sim, task, trunk, tree
         self.members, self.first, self.ensemble = len(trunk), trunk[0].k, task.ensemble
         self.modes, self.parents = tree.modes.numpy().T, tree.parent.numpy()
+        self.changes = [True, *(self.modes[1:] != self.modes[:-1]).any(1).tolist()]  # by step
         self.horizon, self.stages = len(self.modes), len(task.cost.stage)
         self.limit = bound if task.cost.nonnegative else math.inf
         self.slack = 1e-9 * abs(self.limit)  # more than rounding can make of partial cost and lower bound
@@ -157,7 +158,7 @@ class _Rollout:
             x, u_prev = self._give_up(i, x, u_prev)
         if self.size == 0:
             return
-        if self.crew is None or (self.modes[i] != self.modes[i - 1]).any():
+        if self.crew is None or self.changes[i]:
             modes = self._each(self.modes[i, self.ids])
             self.crew = self.worlds.crew(self.at, modes, modes if self.constant else self._before(i))
         u = self.worlds.act(self.crew, x, u_prev, k)

@@ -71,7 +71,7 @@ class Flight:
 
     @property
     def _landed(self) -> bool:
-        return self.modes[-200:] == [HAND] * 200
+        return self.modes[-200:] == [HAND] * 150
 
     def _press(self) -> None:
         """START, for 50 ms whenever it leads on; the handstand is asked for 2 s into the foot stand."""
@@ -143,15 +143,15 @@ def test_a_flip_is_left_alone_until_the_handstand_and_given_up_if_it_is_not_take
 def test_before_it_is_asked_for_the_foot_stand_goes_on() -> None:
     record = planner(5).plan(situation(asked=-1), 5)
     assert record is not None
-    assert record["modes"][: record["steps"]].tolist() == [FOOT] * 30
+    assert record["modes"][: record["steps"]].tolist() == [FOOT] * 20
 
 
 def test_in_the_handstand_plans_are_short() -> None:
-    it = planner(5, 0, "rest=20")
+    it = planner(5, 0, "rest=15")
     x = HANDSTAND.state().numpy()
     record = it.plan(situation(x=x, u=x[7:19], mode=HAND), 5)
     assert record is not None
-    assert record["modes"][: record["steps"]].tolist() == [HAND] * 20
+    assert record["modes"][: record["steps"]].tolist() == [HAND] * 15
 
 
 @pytest.mark.parametrize("wrong", ["lead=50", "rest=51"])

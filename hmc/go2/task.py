@@ -184,7 +184,6 @@ def _in_numpy(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> tuple[StageFn
     weights = np.array([cfg.height, cfg.orientation, cfg.joints, cfg.rate, cfg.energy, cfg.pose])[:, None]
     cpu = torch.float64, torch.device("cpu")
     heights, gravity, poses = (each.numpy() for each in _targets(*cpu))
-    stall, peak, negative, slope = (each.numpy() for each in go2.motor_curve(*cpu))
 
     def place(state: Floats, at: NDArray[np.int64], found: Floats) -> None:
         """Height and orientation without their weights, into `found` (2, n)."""
@@ -202,10 +201,7 @@ def _in_numpy(cfg: CostCfg, target: Callable[[Tensor], Tensor]) -> tuple[StageFn
         np.subtract(q, poses[STAND_TARGET], out=away[2])
         away *= away
         squares = torch.from_numpy(away).sum(2)
-        torque, back = go2.KP * (inputs - q) - go2.KD * qd, slope * qd
-        top = np.minimum(np.maximum(stall - back, negative), peak)
-        bottom = np.minimum(np.maximum(-stall - back, negative), peak)
-        power = torch.from_numpy(qd * np.minimum(np.maximum(torque, bottom), top))
+        power = torch.from_numpy(qd * go2.motor_torque_in_numpy(q, qd, inputs))
         found = np.empty((6, len(state)))
         place(state, at, found[:2])
         found[2:4] = squares[:2]

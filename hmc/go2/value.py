@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hmc.go2 import network
-from hmc.go2.model import motor_torque
+from hmc.go2.model import motor_torque, motor_torque_in_numpy
 from hmc.go2.network import opened
 from hmc.go2.observe import anchor_of, observe
 from hmc.go2.stances import HOLDS
@@ -62,15 +63,17 @@ class Value:
 
     def __call__(self, x: Tensor) -> Tensor:
         """Values of states x (n, 37), (n,)."""
-        q = x[:, 7:19]
-        torque = motor_torque(q, x[:, 25:37], q)
         if x.device.type != "cpu":
+            q = x[:, 7:19]
+            torque = motor_torque(q, x[:, 25:37], q)
             output = self.on_device(seen(observe(x, q, anchor_of(x)), torque, x[:, 2]).float())
         else:  # in numpy: for few states a torch operation takes several times as long
             state = x.numpy()
-            obs = torch.from_numpy(network.observe(state, q.numpy(), network.anchor_of(state)))
-            given = {"obs": seen(obs, torque, x[:, 2]).float().numpy()}
-            output = torch.from_numpy(self._session.run(None, given)[0])
+            held = state[:, 7:19]
+            obs = network.observe(state, held, network.anchor_of(state))
+            pull = 0.1 * motor_torque_in_numpy(held, state[:, 25:37], held)
+            given = np.concatenate([obs, pull, state[:, 2:3]], 1).astype(np.float32)  # as `seen`
+            output = torch.from_numpy(self._session.run(None, {"obs": given})[0])
         return output[:, 0].to(x) / self.rest
 
     def on_device(self, obs: Tensor) -> Tensor:
