@@ -81,8 +81,8 @@ class Planner:
     Until the operator asks for the handstand, the whole horizon wants the foot stand. From then on,
     the moment at which the handstand is wanted moves along ahead of the robot, until a schedule is
     found that ends in it; then it stays where it is, and the plan is sent. A plan that leaves the foot
-    stand for anything but a handstand, or for one that too few other robots come to, is not sent: the robot
-    stands, and the search goes on.
+    stand for anything but a handstand, or for one that too few other robots come to, is not sent, but one
+    to stand on: the search goes on, and is heard of.
 
     Attributes:
         task: what is planned while a flip is looked for.
@@ -174,7 +174,7 @@ class Planner:
             return None
         searching = int(state["asked"]) >= 0 and start.mode == FOOT and self._command is None
         if int(state["asked"]) < 0:
-            return self._ship(state, begin, start, self._follow(self._calm, start, [FOOT] * self._cfg.rest))
+            return self._stand(state, begin, start)
         if searching:
             start = replace(start, k=self._wanted - self._cfg.lead)
             effort, modes = self._cfg.search if self._known else self._cfg.first, self._guess
@@ -201,11 +201,11 @@ class Planner:
         if searching:
             known, self._known, self._guess = self._known, reached, list(found.schedule)
             if not (known and reached and self._agreed(start)):
-                return None
+                return self._stand(state, begin, start)
             self._command = begin + self._cfg.lead
         elif not reached:
             self._command, self._known, self._guess = None, False, list(found.schedule)
-            trace = self._follow(self.task, start, [FOOT] * self._horizon)
+            return self._stand(state, begin, start)
         return self._ship(state, begin, start, trace)
 
     def landed(self, start: Start, modes: Sequence[int]) -> float:
@@ -213,6 +213,11 @@ class Planner:
         evaluator = Evaluator(self._others, self._one, start)
         evaluator.follow(Schedule(tuple(modes), NAMES))
         return float(np.mean([self._reached(trace) for trace in evaluator.trunks]))
+
+    def _stand(self, state: np.ndarray, begin: int, start: Start) -> np.ndarray | None:
+        """The plan to go on standing on the hind legs, as a value of the plan's slot."""
+        start = replace(start, k=0)  # long before the handstand is wanted
+        return self._ship(state, begin, start, self._follow(self._calm, start, [FOOT] * self._cfg.rest))
 
     def _reached(self, trace: Trace) -> bool:
         return len(trace) == self._horizon and bool(HANDSTAND.held(trace.x[-1:]))

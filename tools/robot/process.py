@@ -127,7 +127,9 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
     say(f"ready: {where}, {priority()}")
     clock = Clock(PERIOD / args.speed)
     while robot.time < args.seconds and not stopped():
-        for frame in outgoing:
+        if not args.lockstep:
+            clock.wait()
+        for frame in outgoing:  # measured now, and worked out before: a robot's clock waits for nothing
             states.write(frame)
         switcher.serve()
         robot.release(switcher.name == "")
@@ -137,7 +139,6 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
             if not frames:  # nobody there yet, or a frame was lost: say it again
                 continue
         else:
-            clock.wait()
             frames = commands.take()
         outgoing = robot.step(frames)
         truth = robot.truth()
