@@ -124,11 +124,8 @@ def situation(**fields: Any) -> np.ndarray:
 def test_a_flip_is_left_alone_until_the_handstand_and_given_up_if_it_is_not_taken_over() -> None:
     it = planner(5)
     assert not it.committed(situation())
-    for k in range(100, 200):
-        record = it.plan(situation(k=k), 5)
-        assert record is not None
-        if HAND in record["modes"][: record["steps"]]:
-            break
+    plans = (it.plan(situation(k=k), 5) for k in range(100, 200))
+    record = next(plan for plan in plans if plan is not None and HAND in plan["modes"][: plan["steps"]])
     begin, modes = int(record["begin"]), record["modes"][: record["steps"]].tolist()
     assert modes[0] == FOOT
     assert modes[-1] == HAND
