@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="needs the deploy extra: pip install -e .[deploy]")
 
 from deploy.codec import RobotState, decode_state, encode_command
-from deploy.dds import Link, LinkError, Subscriber
+from deploy.dds import Link, LinkError, Publisher, Subscriber
 from deploy.messages import LowCmd_, LowState_, WirelessController_
 from deploy.motion_switcher import MotionSwitcher
 from deploy.remote import Button, unpack
@@ -29,7 +30,7 @@ from hmc.go2 import model as go2
 from tools.go2_robot import main
 from tools.robot.motors import hold
 from tools.robot.orders import obey
-from tools.robot.process import Args, Log, run
+from tools.robot.process import Args, Clock, Log, run
 from tools.robot.standin import Settings, StandIn, Truth, ideal
 
 ROOT = Path(__file__).parent.parent
@@ -143,6 +144,30 @@ def test_lockstep_is_the_class_to_the_byte() -> None:
     for _ in range(59):
         expected += here.step([STAND])
     assert list(heard.values()) == expected
+
+
+def test_states_leave_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it takes to work a state out is no part of a robot's delay."""
+    done: list[str] = []
+
+    def note(of: type, name: str, what: str) -> None:
+        before = getattr(of, name)
+
+        def noted(self: Any, *args: Any) -> Any:
+            if getattr(self, "_topic", "rt/lowstate") == "rt/lowstate":
+                done.append(what)
+            return before(self, *args)
+
+        monkeypatch.setattr(of, name, noted)
+
+    monkeypatch.setattr("tools.robot.process.priority", lambda: "the test's own priority")
+    note(Clock, "wait", "wait")
+    note(Publisher, "write", "state")
+    note(StandIn, "step", "step")
+    run(Args(domain=DOMAIN, seconds=0.05), lambda: False, lambda _: None)
+    turns = len(done) // 3
+    assert turns > 20
+    assert done == ["step", *["wait", "state", "step"] * turns]
 
 
 @pytest.mark.parametrize(

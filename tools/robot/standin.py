@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import mujoco
@@ -17,7 +18,6 @@ from deploy.codec import (
     HEAD,
     LOW_LEVEL,
     STOP,
-    CommandFrame,
     Floats,
     FrameError,
     MotorCommand,
@@ -191,31 +191,16 @@ class StandIn:
 
     def _receive(self, frame: bytes) -> None:
         try:
-            command = decode_command(frame)
+            motors, objection = _judged(frame, self._strict)
         except FrameError:
             self.refused["no LowCmd frame"] += 1
             return
-        if (reason := self._objection(command)) is not None:
-            self.refused[reason] += 1
+        if objection := objection or ("" if self.released else "not released"):
+            self.refused[objection] += 1
             return
-        self._command, self._heard = command.motors, self.time
+        self._command, self._heard = motors, self.time
         self._data.eq_active[0] = False
         self.accepted += 1
-
-    def _objection(self, command: CommandFrame) -> str | None:
-        """Why a command is not followed, or None."""
-        if not command.crc_ok:
-            return "checksum"
-        if self._strict and command.head != HEAD:
-            return "head"
-        if self._strict and command.level_flag != LOW_LEVEL:
-            return "level flag"
-        mode = command.motors.mode
-        if not ((mode == FOC) | (mode == STOP)).all():
-            return "motor mode"
-        if not np.isfinite(np.concatenate(command.motors[:5])).all():
-            return "not a number"
-        return None if self.released else "not released"
 
     def _active(self) -> MotorCommand:
         """What the motors follow now."""
@@ -260,6 +245,23 @@ class StandIn:
             current=round(1000 * self._battery.current),
             voltage=self._battery.voltage,
         )
+
+
+@lru_cache(maxsize=1)  # between two control steps a controller says the same again
+def _judged(frame: bytes, strict: bool) -> tuple[MotorCommand, str]:
+    """What a LowCmd frame tells the motors, and why it is not followed; "" if it may be."""
+    command = decode_command(frame)
+    mode = command.motors.mode
+    if not command.crc_ok:
+        return command.motors, "checksum"
+    if strict and command.head != HEAD:
+        return command.motors, "head"
+    if strict and command.level_flag != LOW_LEVEL:
+        return command.motors, "level flag"
+    if not ((mode == FOC) | (mode == STOP)).all():
+        return command.motors, "motor mode"
+    finite = np.isfinite(np.concatenate(command.motors[:5])).all()
+    return command.motors, "" if finite else "not a number"
 
 
 def _start(start: Start) -> Floats:
