@@ -24,7 +24,7 @@ from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
 from deploy.log import pipe  # noqa: E402
 from deploy.loop import policies  # noqa: E402
 from deploy.memory import Memory  # noqa: E402
-from deploy.process import ENVIRONMENT, Job, share_cores, spawn  # noqa: E402
+from deploy.process import ENVIRONMENT, Job, allowed, share_cores, spawn  # noqa: E402
 from deploy.safety import Phase  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
@@ -64,6 +64,8 @@ class Args:
         keys: the keyboard has the remote's buttons, and pushes; on the stand-in only.
         speed: of the stand-in's clock, for slow motion where the machine is busy; 1 on a robot.
         real_time: ask the kernel for real-time priority.
+        awake: keep the control process's core from halting between state frames, which takes power; with
+            real-time priority only.
     """
 
     interface: str = LOOPBACK
@@ -83,6 +85,7 @@ class Args:
     keys: bool = False
     speed: float = 1.0
     real_time: bool = True
+    awake: bool = True
 
     @property
     def simulated(self) -> bool:
@@ -211,6 +214,8 @@ def run(args: Args, console: Console, port: Port | None) -> Memory:
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE}
         control = spawn("loop", Job(**{**base, "log": sink}), [board.descriptor, sink], **pipes)
         os.close(sink)
+        if args.awake and base["core"] is not None and args.real_time and allowed():
+            stack.callback(_end, spawn("awake", Job(**base), []))
         stack.callback(_end, control)  # before all others, whose end takes its time
         console.print(f"control process: {_ready(control, 'the control process').strip()}", highlight=False)
         if not args.dry_run:
