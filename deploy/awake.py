@@ -1,7 +1,7 @@
 """Keeps the control process's core from halting between two state frames: it would wake up late, and cold.
 
-It has the lowest priority there is, which still gets a slice of 4 ms now and then beside normal ones: it is for
-a control process with real-time priority, which takes the core at once.
+It has the lowest priority there is, which still gets a slice of 4 ms now and then beside a normal one: it is
+for a control process with real-time priority, which takes the core at once.
 """
 
 from __future__ import annotations
