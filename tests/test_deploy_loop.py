@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -14,12 +18,12 @@ from deploy.codec import decode_command, decode_state, encode_state
 from deploy.control import TICK
 from deploy.log import Recorder
 from deploy.loop import Loop
-from deploy.process import share_cores
+from deploy.process import ROOT, share_cores
 from deploy.remote import Button, Remote, pack
 from deploy.safety import Phase
 from deploy.settings import WatchdogCfg
 from deploy.slots import Board, Slot, text
-from deploy.watchdog import Watchdog
+from deploy.watchdog import Process, Watchdog
 from tests.test_deploy_control import Met, duplicate, met
 
 __all__ = ["met"]  # a fixture
@@ -266,3 +270,31 @@ def test_control_shares_its_core_with_nobody(monkeypatch):
     assert shared({0, 1}) == (1, {0})
     assert shared({2, 5, 7}) == (7, {2, 5})
     assert shared({3}) == (None, {3})
+
+
+def test_what_keeps_a_core_awake_gives_way_and_ends_with_its_parent():
+    core = max(os.sched_getaffinity(0))
+    code = (
+        "import time; from deploy.process import Job, spawn\n"
+        f"print(spawn('awake', Job(core={core}), []).pid, flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        it = int(parent.stdout.readline())
+        until = time.monotonic() + 10.0
+        while os.sched_getscheduler(it) != os.SCHED_IDLE and time.monotonic() < until:
+            time.sleep(0.01)
+        assert os.sched_getscheduler(it) == os.SCHED_IDLE
+        assert os.sched_getaffinity(it) == {core}
+        os.kill(it, signal.SIGINT)  # the terminal's are its parent's business
+        os.kill(it, signal.SIGHUP)
+        time.sleep(0.2)
+        assert Path(f"/proc/{it}/stat").read_text().rsplit(")", 1)[1].split()[0] == "R"
+        process = Process(it)
+        assert not process.ends
+        parent.kill()
+    until = time.monotonic() + 5.0
+    while not process.ends and time.monotonic() < until:
+        time.sleep(0.01)
+    assert process.ends
+    process.close()

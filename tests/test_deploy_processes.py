@@ -351,34 +351,6 @@ def test_however_the_program_ends_the_robot_is_damped_until_it_lies(program, how
         program.end()
 
 
-def test_what_keeps_a_core_awake_gives_way_and_ends_with_its_parent():
-    core = max(os.sched_getaffinity(0))
-    code = (
-        "import time; from deploy.process import Job, spawn\n"
-        f"print(spawn('awake', Job(core={core}), []).pid, flush=True); time.sleep(60)"
-    )
-    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE) as parent:
-        assert parent.stdout is not None
-        it = int(parent.stdout.readline())
-        until = time.monotonic() + 10.0
-        while os.sched_getscheduler(it) != os.SCHED_IDLE and time.monotonic() < until:
-            time.sleep(0.01)
-        assert os.sched_getscheduler(it) == os.SCHED_IDLE
-        assert os.sched_getaffinity(it) == {core}
-        os.kill(it, signal.SIGINT)  # the terminal's are its parent's business
-        os.kill(it, signal.SIGHUP)
-        time.sleep(0.2)
-        assert Path(f"/proc/{it}/stat").read_text().rsplit(")", 1)[1].split()[0] == "R"
-        process = Process(it)
-        assert not process.ends
-        parent.kill()
-    until = time.monotonic() + 5.0
-    while not process.ends and time.monotonic() < until:
-        time.sleep(0.01)
-    assert process.ends
-    process.close()
-
-
 @pytest.mark.deploy
 def test_the_foot_stand_goes_on_without_the_planner(program):
     program.until("hybrid foot")
