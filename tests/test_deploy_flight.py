@@ -71,7 +71,7 @@ class Flight:
 
     @property
     def _landed(self) -> bool:
-        return self.modes[-200:] == [HAND] * 150
+        return self.modes[-200:] == [HAND] * 200
 
     def _press(self) -> None:
         """START, for 50 ms whenever it leads on; the handstand is asked for 2 s into the foot stand."""
