@@ -75,7 +75,7 @@ STATUS = np.dtype(
     ]
 )
 
-_TURN = struct.Struct("<Q")
+_TURN = 8  # octets of the number of the newer buffer's value
 _HEAD = struct.Struct("<QI4x")  # number of the value, checksum of number and value
 _TRIES = 8
 
@@ -92,12 +92,14 @@ class Slot:
     def __init__(self, memory: mmap.mmap, offset: int, kind: np.dtype[np.void]):
         self.kind = kind
         self._memory, self._offset = memory, offset
+        # stored and loaded in one piece: struct puts zeros there first, octet by octet, for a reader to find
+        self._turn = memoryview(memory)[offset : offset + _TURN].cast("Q")
         self._stride = _HEAD.size + kind.itemsize
 
     @staticmethod
     def size(kind: np.dtype[np.void]) -> int:
         """Octets that a slot of this layout takes, a multiple of 64."""
-        return -(-(_TURN.size + 2 * (_HEAD.size + kind.itemsize)) // 64) * 64
+        return -(-(_TURN + 2 * (_HEAD.size + kind.itemsize)) // 64) * 64
 
     def blank(self) -> np.ndarray:
         """A value of zeros to fill in, shape ()."""
@@ -113,7 +115,7 @@ class Slot:
         at = self._at(number)
         _HEAD.pack_into(self._memory, at, number, check)
         self._memory[at + _HEAD.size : at + self._stride] = octets
-        _TURN.pack_into(self._memory, self._offset, number)
+        self._turn[0] = number
 
     def read(self) -> np.ndarray | None:
         """The newest whole value, shape (), the reader's own; None before the first."""
@@ -131,10 +133,14 @@ class Slot:
     @property
     def count(self) -> int:
         """How many values were written; it tells whether there is a new one."""
-        return int(_TURN.unpack_from(self._memory, self._offset)[0])
+        return self._turn[0]
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        self._turn.release()
 
     def _at(self, number: int) -> int:
-        return self._offset + _TURN.size + (number & 1) * self._stride
+        return self._offset + _TURN + (number & 1) * self._stride
 
 
 class Board:
@@ -164,10 +170,12 @@ class Board:
         for _, kind in self._LAYOUT:
             slots.append(Slot(self._memory, offset, kind))
             offset += Slot.size(kind)
-        self.heart, self.guard, self.state, self.plan, self.status = slots
+        self.heart, self.guard, self.state, self.plan, self.status = self._slots = slots
 
     def close(self) -> None:
         """Give the memory back."""
+        for slot in self._slots:
+            slot.close()
         self._memory.close()
         os.close(self.descriptor)
 

@@ -19,6 +19,7 @@ ROOT = Path(__file__).parent.parent
 # Writes values whose numbers all agree, as fast as it can, until it is killed.
 WRITER = """
 import sys
+import time
 from deploy.slots import Board
 board = Board(int(sys.argv[1]))
 value, n = board.state.blank(), 0
@@ -108,6 +109,26 @@ def test_readers_of_a_busy_writer_that_is_killed(board):
     assert (last["x"] == last["k"]).all()
     board.state.write(value(board, 5))  # a new writer goes on where it was
     assert board.state.read()["k"] == 5
+
+
+def test_once_there_is_a_value_a_reader_always_finds_one(board):
+    """A reader that looks as often as it can, while a value is replaced some thousand times a second."""
+    board.state.write(value(board, 0))
+    command = [
+        sys.executable,
+        "-c",
+        WRITER.replace("    n +=", "    time.sleep(1e-4)\n    n +="),
+        str(board.descriptor),
+    ]
+    with subprocess.Popen(command, cwd=ROOT, pass_fds=[board.descriptor]) as writer:
+        slot, counts, nothing, until = board.state, [1], 0, time.monotonic() + 10
+        while counts[-1] < 4000 and time.monotonic() < until:
+            counts.append(slot.count)
+            nothing += slot.read() is None
+        writer.kill()
+    assert counts[-1] >= 4000
+    assert counts == sorted(counts)
+    assert nothing == 0
 
 
 def test_sizes_are_whole_cache_lines():
