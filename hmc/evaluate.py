@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -64,7 +65,7 @@ class Evaluator:
         self._worlds = Worlds(task, self.sim)
         self._root = roots(self._worlds, [start] if task.ensemble is None else task.ensemble.starts(start))
         if known is not None and len(self._root) == 1 and known.meets(self._root[0]):
-            self._root = (known,)
+            self._root = (known if known.ran == start.ran else replace(known, ran=start.ran),)
         self.renew()
 
     def renew(self) -> None:
@@ -175,9 +176,10 @@ class Evaluator:
         wanted, horizon = _spelt(_some(schedules, np.flatnonzero(new))).cpu(), self.task.horizon
         ahead = [schedule.tensor()[None].to(wanted.dtype) for schedule in self._beside]
         shared, alone = added_steps(torch.cat([*ahead, wanted]), self._lead)
-        # a part that does not fit into the simulator with those before it rolls one beginning out again
+        # a part that does not fit into the simulator with those before it rolls one beginning out again, and
+        # where it is rolled out with each batch, what is built on as well
         parts = np.arange(len(shared)) // max(1, self.size - len(ahead))
-        steps = shared.cumsum() + parts * horizon
+        steps = shared.cumsum() + parts * horizon * (2 if ahead and self._again else 1)
         if not ahead:
             steps = np.minimum(steps, alone.cumsum())
         return len(self._trunk) * np.concatenate([[0], steps])[len(ahead) + new.cumsum()]
@@ -274,9 +276,9 @@ class Evaluator:
 
     def _keep(self, rows: Rows, rolled: Rolled) -> None:
         """How to come by the traces of schedules just rolled out."""
-        traces = rolled.traces
+        traces, whole = rolled.traces, ~rolled.pruned.numpy()
         self._traces = (
-            {} if traces is None else {row: partial(traces, i) for i, row in enumerate(rows.tolist())}
+            {} if traces is None else {int(rows[i]): partial(traces, i) for i in whole.nonzero()[0].tolist()}
         )
 
     def _know(self, schedule: Schedule) -> float:

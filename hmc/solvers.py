@@ -161,9 +161,10 @@ class Search:
             costs = self._roll(batch[: room + len(pairs)])
             self.begin()
             known = ~costs.isnan()
-            self.best = replace(self.best, seen=self.best.seen + int(known[:room].sum()))
             found = torch.where(known, costs, math.inf)
             yield indices, found[:room], pairs, found[room:]
+            # only now, when what improves has been offered: or Ctrl-C in between leaves a false certificate
+            self.best = replace(self.best, seen=self.best.seen + int(known[:room].sum()))
             if self.stopped_by or not known.all():
                 self.stopped_by = self.stopped_by or "seconds"
                 return
@@ -275,7 +276,7 @@ SOLVERS: dict[str, Callable[[Search], None]] = {"sample": sample, "exhaustive": 
 def run(search: Search, solve: Callable[[Search], None], iterations: float) -> None:
     """Algorithm 1: solve the single-switch problem and stitch, until no switch improves."""
     while search.stopped_by is None:
-        if len(search.best.switches) >= iterations:
+        if len(search.best.steps) >= iterations:
             search.stopped_by = "iterations"
             return
         solve(search)

@@ -74,13 +74,15 @@ class Trace:
 
     @cached_property
     def terms(self) -> Tensor:
-        """Each term's share of the cost, stage terms first, (number of terms,); NaN where diverged."""
+        """Each term's share of the cost, stage terms first, (number of terms,); NaN where it ended early."""
         terms = torch.cat([self.sums[-1], self.terminal])
-        return terms if bool(terms.isfinite().all()) else torch.full_like(terms, math.nan)
+        # of a cost without terminal terms, what was summed up to there would pass for all of it
+        arrived = len(self) == len(self.modes) and bool(self.x[-1].isfinite().all())
+        return terms if arrived and bool(terms.isfinite().all()) else torch.full_like(terms, math.nan)
 
     @cached_property
     def cost(self) -> float:
-        """J; inf where the world diverged."""
+        """J; inf where the world diverged, or a guard barred a mode."""
         cost = float(total(self.terms[None])[0])
         return cost if math.isfinite(cost) else math.inf
 

@@ -112,7 +112,7 @@ class Worlds:
         action = torch.empty_like(u)
         for part in crew.parts:
             if part.rows is None:
-                return self._act(part, x, u, k)
+                return action.copy_(self._act(part, x, u, k))  # a mode may fill the same buffer at each step
             acted = self._act(part, x.index_select(0, part.rows), u.index_select(0, part.rows), k)
             action.index_copy_(0, part.rows, acted)
         return action
@@ -132,7 +132,8 @@ class Worlds:
         nested = mode.control_steps
         action, after = mode.act(x, u, memory, ks)
         self.nested_steps += mode.control_steps - nested
-        if size > 0 and after is not memory:
+        # what was picked out is a copy, which a mode may have changed in place
+        if size > 0 and (after is not memory or isinstance(part.at, Tensor)):
             self.memory[part.at, :size] = _shaped(mode, "act() memory", after, (n, size)).to(memory.dtype)
         return _shaped(mode, "act() actions", action, (n, self.sim.nu)).to(u.dtype)
 
