@@ -39,8 +39,7 @@ _CONFIG = """<CycloneDDS><Domain Id="any">
 # Plain CDR is all that the robot's firmware reads. A writer offers reliability to whoever asks for it.
 _REPRESENTATION = Policy.DataRepresentation(use_cdrv0_representation=True)
 _RELIABLE = Policy.Reliability.Reliable(max_blocking_time=1_000_000)  # ns
-_ALIVE = ViewState.Any | SampleState.Any | InstanceState.Alive
-_MANY = 1000  # endpoints of a domain, at most
+_ALL = 1000  # endpoints of a domain that are new, at most
 
 
 class LinkError(RuntimeError):
@@ -159,8 +158,9 @@ class Link:
             ) from error
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._participants = BuiltinDataReader(self._participant, BuiltinTopicDcpsParticipant)
-        self._alive = ReadCondition(self._publications, _ALIVE)
-        self._present = ReadCondition(self._participants, _ALIVE)
+        # the publishers and participants that there are, by their keys
+        self._writers: dict[Any, Any] = {}
+        self._present: dict[Any, Any] = {}
 
     def publisher(self, topic: str, message: type[IdlStruct]) -> Publisher:
         """A publisher of frames of this message type."""
@@ -180,7 +180,7 @@ class Link:
         """
         return Subscriber(self._participant, self._topic(topic, message), depth, reliable)
 
-    def rivals(self, topic: str, ours: Collection[int] = ()) -> list[str]:
+    def rivals(self, topic: str, ours: Collection[int] = (), most: int = _ALL) -> list[str]:
         """Who else publishes a topic: a name, host and process for each publisher outside this link.
 
         Two controllers on rt/lowcmd would both move the motors: ask before commanding, and while doing so.
@@ -190,20 +190,39 @@ class Link:
         Args:
             topic: its name.
             ours: numbers of processes on this machine that may.
+            most: publishers, of any topic, that are looked at for the first time in this call: each takes
+                0.1 ms, and a robot has hundreds. Those that are known take nothing.
         """
-        own = self._participant.guid
-        writers = self._publications.read(_MANY, self._alive)
-        keys = [it.participant_key for it in writers if it.topic_name == topic and it.participant_key != own]
-        if not keys:
-            return []
-        found = {it.key: it.qos for it in self._participants.read(_MANY, self._present)}
-        names = {key: _name(qos) for key, qos in found.items() if _process(qos) not in ours}
-        return [names.get(key, f"participant {key}") for key in keys if key in names or key not in found]
+        _follow(self._publications, self._writers, most)
+        _follow(self._participants, self._present, _ALL)  # after their publishers, which nobody then lacks
+        own, found = self._participant.guid, self._present
+        keys = [
+            it.participant_key
+            for it in self._writers.values()
+            if it.topic_name == topic and it.participant_key != own
+        ]
+        foreign = [key for key in keys if key not in found or _process(found[key].qos) not in ours]
+        return [_name(found[key].qos) if key in found else f"participant {key}" for key in foreign]
 
     def _topic(self, name: str, message: type[IdlStruct]) -> Topic[Any]:
         topic: Topic[Any] = Topic(self._participant, name, message, Qos(_REPRESENTATION))
         topic.data_type = Frame
         return topic
+
+
+def _follow(reader: BuiltinDataReader, known: dict[Any, Any], most: int) -> None:
+    """Take down what has come to a domain and what has left it since the last call."""
+    for it in reader.take(most):
+        if it.sample_info.instance_state == InstanceState.Alive:
+            known[it.key] = it
+        else:
+            known.pop(it.key, None)
+
+
+@cache
+def _host() -> str:
+    """This machine's name when it was first asked for: DHCP may change it, not what participants say."""
+    return socket.gethostname()
 
 
 @cache
@@ -221,7 +240,7 @@ def _told(qos: Qos) -> dict[str, str]:
 def _process(qos: Qos) -> int:
     """Number of a participant's process on this machine; -1 on another one, or if it does not say."""
     told = _told(qos)
-    here = told.get("__Hostname") == socket.gethostname()
+    here = told.get("__Hostname") == _host()
     return int(told["__Pid"]) if here and told.get("__Pid", "").isdecimal() else -1
 
 

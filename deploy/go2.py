@@ -30,13 +30,18 @@ from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
 from deploy.timing import Stolen  # noqa: E402
 from deploy.view import View  # noqa: E402
+from deploy.watchdog import DAMPED  # noqa: E402
 from hmc.cfg import load  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 
 LOOK = 0.05  # s
 START_UP = 60.0  # s for a process to be ready
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # what ends a run: a lost terminal, too
-DAMPED = 3.0  # s of the watchdog's damping after the control process: a robot on two legs falls meanwhile
+ENDING = (
+    signal.SIGINT,
+    signal.SIGTERM,
+    signal.SIGHUP,
+    signal.SIGQUIT,
+)  # what ends a run: a lost terminal, too
 
 
 @dataclass(frozen=True)

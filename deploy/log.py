@@ -33,7 +33,7 @@ from deploy.process import Job, told, until_told
 from deploy.settings import DeployCfg
 from hmc.cfg import dump, load
 
-VERSION = "3"
+VERSION = "4"
 METADATA = "hmc"
 STATE, COMMAND, TICK_RECORD, PLAN, EVENT = range(5)
 TOPICS = ("rt/lowstate", "rt/lowcmd", "tick", "plan", "event")
@@ -50,6 +50,7 @@ TICK = np.dtype(
         ("plan", "i8"),
         ("late", "f8"),  # ms
         ("compute", "f8"),  # ms from the frame's arrival until the command left
+        ("left", "f8"),  # when it did, by this machine's monotonic clock [s]
         ("x", "f8", 37),
         ("variance", "f8", N),
         ("u", "f8", 12),

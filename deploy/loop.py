@@ -39,6 +39,7 @@ HEARD = 3.0  # s for the first one
 COMPANY = 0.4  # s for other controllers to be found
 LAST = 0.3  # s of damping before a program that is told to end does
 ROUND = 0.05  # s between two looks for other controllers
+STRANGERS = 16  # publishers that are new to it, in such a look
 LATE = 0.02  # s after the frames came: who commands only then looks at the watchdog once more
 FOLDED = 0.6  # rad off the pose in which the robot lies, at most, where its own controller may be stopped
 _PRESENCE = 1.0  # s without a word of a planner that waits
@@ -208,7 +209,7 @@ class Loop:
         """Fail where another program commands the motors as well."""
         guard = self._board.guard.read()
         ours = () if guard is None else (int(guard["pid"]),)
-        if others := self._link.rivals("rt/lowcmd", ours):
+        if others := self._link.rivals("rt/lowcmd", ours, STRANGERS):
             self._control.fail(f"another program commands the motors: {others[0]}")
 
     def _take(self) -> None:
@@ -275,6 +276,7 @@ class Loop:
             performer.mode,
         )
         tick["plan"], tick["late"], tick["compute"] = plan.number if plan else 0, late, 1e3 * (left - now)
+        tick["left"] = left
         tick["u"] = np.nan_to_num(control.target)
         tick["anew"] = round(1e3 * max(control.estimator.anew, -0.001))
         if estimate is not None:

@@ -74,14 +74,17 @@ class Job:
 def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:
     """Start a module of `deploy` as a process that inherits these descriptors.
 
-    It runs in the project's folder; what the job's paths are relative to is this process's.
+    It runs in the project's folder; what the job's paths are relative to is this process's. In a session of
+    its own: what a key such as Ctrl-\\ or Ctrl-Z kills or stops is the program, not who holds the robot.
     """
     paths: dict[str, Any] = {
         name: str(Path(path).absolute()) for name in _PATHS if (path := getattr(job, name))
     }
     job = replace(job, **paths)
     command = [sys.executable, "-m", f"deploy.{module}", json.dumps(asdict(job))]
-    return subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, pass_fds=descriptors, text=True, **streams)
+    return subprocess.Popen(
+        command, cwd=ROOT, env=ENVIRONMENT, pass_fds=descriptors, text=True, start_new_session=True, **streams
+    )
 
 
 def told() -> Job:

@@ -16,6 +16,7 @@ from deploy.log import read
 from deploy.modes import HAND, NAMES, NONE
 from deploy.safety import Phase
 from deploy.so3 import matrix
+from deploy.timing import Lateness
 from hmc.go2.model import DT
 from hmc.go2.stages import judge
 
@@ -40,11 +41,7 @@ def summarise(log: Path, truth: Path | None = None) -> dict[str, Any]:
     hybrid = [tick for tick in ticks if tick["phase"] == Phase.HYBRID]
     end = next((event for event in events if event["what"] == "end"), {})
     reasons = [event["reason"] for event in events if event["what"] == "phase" and event["reason"]]
-    late = np.array([tick["late"] for tick in ticks] or [0.0])
-    quantiles = (0.5, 0.99, 0.999, 1.0)
-    percentiles = dict(
-        zip(("p50", "p99", "p99.9", "max"), np.quantile(late, quantiles).round(3).tolist(), strict=True)
-    )
+    own, response = ([], []) if truth is None else responses(truth, ticks)
     seconds = [plan["seconds"] for plan in plans] or [0.0]
     compute = [tick["compute"] for tick in ticks] or [0.0]
     return {
@@ -53,7 +50,9 @@ def summarise(log: Path, truth: Path | None = None) -> dict[str, Any]:
         "estimate": None if truth is None else accuracy(truth, hybrid),
         "ticks": len(ticks),
         "missed": end.get("missed"),
-        "late_ms": percentiles,
+        "late_ms": _percentiles([tick["late"] for tick in ticks]),
+        "late_own_ms": _percentiles(own),
+        "response_ms": _percentiles(response),
         "compute_ms_p50": round(float(np.median(compute)), 3),
         "plans": len(plans),
         "plans_per_s": round(len(plans) / max(DT * len(hybrid), DT), 1),
@@ -67,6 +66,31 @@ def summarise(log: Path, truth: Path | None = None) -> dict[str, Any]:
         "end": end.get("phase"),
         "reasons": reasons,
     }
+
+
+def responses(path: Path, ticks: list[dict[str, Any]]) -> tuple[list[float], list[float]]:
+    """What of a tick's time is the deployment's own, where the stand-in's log says when its states left.
+
+    Returns:
+        How late each tick is, as `deploy.timing.Lateness` has it, but for what the stand-in was late with its
+        state; and the time from when that left until the command did [ms].
+    """
+    with np.load(path) as truth:
+        left = dict(zip(truth["tick"].tolist(), truth["left"].tolist(), strict=True))
+    lateness, own, response = Lateness(), [], []
+    for tick in ticks:
+        if tick["ms"] in left:
+            own.append(lateness.add(left[tick["ms"]], tick["left"]))
+            response.append(1e3 * (tick["left"] - left[tick["ms"]]))
+    return own, response
+
+
+def _percentiles(values: list[float]) -> dict[str, float] | None:
+    """Of some times; None for none."""
+    if not values:
+        return None
+    found = np.quantile(values, (0.5, 0.99, 0.999, 1.0)).round(3).tolist()
+    return dict(zip(("p50", "p99", "p99.9", "max"), found, strict=True))
 
 
 def stages(x: np.ndarray, modes: list[int]) -> dict[str, bool] | None:

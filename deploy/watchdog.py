@@ -24,6 +24,7 @@ from deploy.timing import Silence
 from hmc.cfg import load
 
 PRIORITY = 60
+DAMPED = 3.0  # s of damping after the control process: a robot on two legs falls meanwhile
 _FLAGS, _EXITING = 5, 0x4  # field after the process's state; PF_EXITING of Linux
 
 
@@ -71,6 +72,7 @@ class Watchdog:
 
     Attributes:
         reason: why the robot is damped; "" while it is not.
+        needed: whether the control process commands, so that somebody has to watch it.
 
     Args:
         board: slots.
@@ -78,7 +80,7 @@ class Watchdog:
     """
 
     def __init__(self, board: Board, cfg: WatchdogCfg):
-        self.reason = ""
+        self.reason, self.needed = "", False
         self._board = board
         self._silence = Silence(cfg.hang, cfg.stall, 2 * cfg.period)
         self._say(0.0)  # whose publisher it is that others are going to see
@@ -92,7 +94,8 @@ class Watchdog:
         """
         heart = self._board.heart.read()
         # a control process that has commanded nothing yet leaves the robot as it is
-        if not self.reason and heart is not None and heart["commanding"]:
+        self.needed = heart is not None and bool(heart["commanding"])
+        if not self.reason and heart is not None and self.needed:
             if heart["t"] != self._silence.heard:
                 self._silence.hear(float(heart["t"]))
             if gone:
@@ -121,17 +124,20 @@ def watch(
 ) -> None:
     """Watch the process of this number; publish the frame from the latch on.
 
-    It ends when `stopped()`, and `after` seconds after it has lost its parent, or has latched since.
+    When `stopped()`, it ends, but not while it is needed, nor before the robot was damped for DAMPED seconds:
+    whoever ends a group of processes tells this one and the control process at once. It ends `after` seconds
+    after it has lost its parent, or has latched since.
     """
-    parent = os.getppid()
-    orphaned = time.monotonic() if parent == 1 else math.inf
+    parent, now = os.getppid(), time.monotonic()
+    orphaned, damped = now if parent == 1 else math.inf, math.inf
     it, gone = Process(pid), False
-    while not stopped():
+    while not (stopped() and (now - damped > DAMPED if watchdog.reason else not watchdog.needed)):
         time.sleep(period)
         gone = gone or it.ends
         now, latched = time.monotonic(), bool(watchdog.reason)
         if watchdog.look(gone, now):
             publisher.write(frame)
+            damped = min(damped, now)
         if os.getppid() != parent and (orphaned == math.inf or bool(watchdog.reason) != latched):
             orphaned = now
         if now - orphaned > after:
@@ -140,7 +146,7 @@ def watch(
 
 
 def main(job: Job) -> None:
-    """Be the watchdog until SIGTERM."""
+    """Be the watchdog until SIGTERM, see `watch`."""
     stopped = until_told(parent_matters=False)
     cfg = load(job.cfg, DeployCfg, job.set)
     watchdog = Watchdog(Board(job.board), cfg.watchdog)

@@ -72,7 +72,7 @@ class Wire:
     def publisher(self, topic: str, kind: type) -> Wire:
         return self
 
-    def rivals(self, topic: str, ours: tuple[int, ...] = ()) -> list[str]:
+    def rivals(self, topic: str, ours: tuple[int, ...] = (), most: int = 0) -> list[str]:
         return self.others
 
     def follow(self, target: np.ndarray) -> None:

@@ -90,6 +90,21 @@ def test_a_second_publisher_is_found_and_forgotten() -> None:
     assert own.peers == 0
 
 
+def test_new_publishers_are_looked_at_a_few_at_a_time() -> None:
+    """In a domain with hundreds of them, each look would take longer than a control step."""
+    mine, theirs = Link(DOMAIN), Link(DOMAIN)
+    many = [theirs.publisher(f"rt/topic{i}", LowCmd_) for i in range(40)]
+    rival = theirs.publisher("rt/lowcmd", LowCmd_)
+    reader, until = theirs._publications, time.monotonic() + 5  # of the same process: it sees them at once
+    assert len(reader.read(1000)) > 40
+    looks = 0
+    while not mine.rivals("rt/lowcmd", most=16) and time.monotonic() < until:
+        looks += 1
+    assert looks >= 2, "41 publishers are no less than three looks"
+    assert len(mine.rivals("rt/lowcmd", ours=[os.getpid()])) == 0
+    del many, rival
+
+
 def wait(link: Link, count: int = 1) -> list[str]:
     """The rivals on rt/lowcmd, once there are so many, or after two seconds."""
     until = time.monotonic() + 2

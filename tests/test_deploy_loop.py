@@ -47,7 +47,7 @@ class Wire:
     def publisher(self, topic: str, kind: type) -> Wire:
         return self
 
-    def rivals(self, topic: str, ours: tuple[int, ...] = ()) -> list[str]:
+    def rivals(self, topic: str, ours: tuple[int, ...] = (), most: int = 0) -> list[str]:
         return self.others
 
 
@@ -226,7 +226,7 @@ def test_a_watchdog_that_is_starting_is_no_other_program(met: Met):
     ours: list[int] = []
     Watchdog(turns.board, WatchdogCfg())
 
-    def rivals(topic: str, known: tuple[int, ...] = ()) -> list[str]:
+    def rivals(topic: str, known: tuple[int, ...] = (), most: int = 0) -> list[str]:
         ours.extend(known)
         return []
 

@@ -1,10 +1,8 @@
-"""The watchdog, the log and the whole program as processes of their own, ended in every way."""
+"""The watchdog and the log as processes of their own, and bad input."""
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -26,9 +24,8 @@ from deploy.messages import LowCmd_
 from deploy.process import Job, spawn
 from deploy.settings import WatchdogCfg
 from deploy.slots import Board, said
-from deploy.watchdog import Process, Watchdog
+from deploy.watchdog import DAMPED, Process, Watchdog
 from hmc.cli import command_line
-from tests.test_deploy_kills import prompt
 from tools.robot.process import Args as StandInArgs
 
 ROOT = Path(__file__).parent.parent
@@ -162,6 +159,22 @@ def test_a_controller_that_hangs_is_damped_within_100_ms(board):
         assert board.guard.read()["latched"]
 
 
+def test_a_watchdog_that_is_told_to_end_stays_as_long_as_it_is_needed(board):
+    """Who ends a whole group of processes tells it and the control process at once."""
+    with watched(board) as (victim, commands):
+        (watchdog,) = (int(board.guard.read()["pid"]),)
+        beat(board, time.monotonic() + 60.0)
+        time.sleep(0.05)
+        os.kill(watchdog, signal.SIGTERM)
+        assert commands.take(0.3) == []  # the control process lives and commands
+        victim.kill()
+        first, last = until_damped(commands), 0.0
+        while commands.take(0.1):
+            last = time.monotonic()
+        assert last - first > DAMPED - 0.1
+        assert Path(f"/proc/{watchdog}/stat").read_text().split()[2] not in "RS"
+
+
 def test_the_log_keeps_what_came_before_a_death(tmp_path):
     source, sink = pipe()
     process = spawn("log", Job(log=source, path=str(tmp_path / "run.mcap")), [source])
@@ -241,152 +254,3 @@ def test_the_stand_in_is_told_its_settings():
     robot = command_line(StandInArgs, found).robot
     assert (robot.seed, robot.start, robot.loss, robot.state_delay) == (3, "lying", "limp", 0.002)
     assert robot.states.drop == 0.25
-
-
-class Run:
-    """The program with the stand-in, its operator held back; its processes, found by their commands."""
-
-    def __init__(self, out: Path, *arguments: str):
-        self.out = out
-        command = [sys.executable, "deploy/go2.py", "--domain", str(DOMAIN), "--out", str(out), *arguments]
-        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        self.commands = Link(DOMAIN).subscriber("rt/lowcmd", LowCmd_, depth=5000)
-
-    def child(self, name: str) -> int:
-        """Number of one of its processes."""
-        found = subprocess.run(
-            ["pgrep", "-P", str(self.process.pid), "-f", name], capture_output=True, text=True
-        )
-        return int(found.stdout.split()[0])
-
-    def until(self, words: str, timeout: float = 120.0) -> None:
-        """Read what it prints until these words."""
-        assert self.process.stdout is not None
-        until = time.monotonic() + timeout
-        for line in self.process.stdout:
-            if re.search(words, line):
-                return
-            assert time.monotonic() < until, words
-        pytest.fail(f"it ended without {words!r}")
-
-    def gone(self, within: float = 0.0) -> None:
-        """See that nothing of it is left after so long [s]."""
-        until, pattern = time.monotonic() + within, f'--domain {DOMAIN} |"domain": {DOMAIN},'
-        while (
-            left := subprocess.run(["pgrep", "-f", pattern], capture_output=True).stdout.split()
-        ) and time.monotonic() < until:
-            time.sleep(0.1)
-        assert not left
-
-    def end(self) -> dict[str, object]:
-        """Its summary, once it has ended by itself; nothing of it is left."""
-        self.process.communicate(timeout=60)
-        self.gone()
-        return json.loads((self.out / "summary.json").read_text())
-
-
-@pytest.fixture
-def program(tmp_path) -> Iterator[Run]:
-    run = Run(tmp_path)
-    yield run
-    if run.process.poll() is None:
-        run.process.send_signal(signal.SIGINT)
-        run.process.communicate(timeout=60)
-
-
-def damped(program: Run, seconds: float) -> tuple[float, float]:
-    """When the first damping command came, and the longest gap in it [s]; for so long nothing else comes."""
-    first = last = time.monotonic()
-    until, longest, found = first + 5.0, 0.0, False
-    while time.monotonic() < until:
-        for frame in program.commands.take(0.005):
-            if found:
-                assert not decode_command(frame).motors.kp.any()
-                longest = max(longest, time.monotonic() - last)
-            elif not decode_command(frame).motors.kp.any():
-                found, first = True, time.monotonic()
-                until = first + seconds
-            last = time.monotonic()
-    assert found
-    return first, max(longest, time.monotonic() - last)
-
-
-@pytest.mark.clock
-@pytest.mark.deploy
-def test_killed_in_the_foot_stand(program):
-    """The watchdog damps at once, and until the robot lies."""
-    program.until("hybrid foot")
-    time.sleep(1.0)
-    control = program.child("deploy.loop")
-    program.commands.take()
-    with prompt():
-        os.kill(control, signal.SIGKILL)
-        killed = time.monotonic()
-        first, gap = damped(program, 2.5)
-    assert first - killed < 0.02
-    assert gap < 0.05
-    program.end()
-
-
-@pytest.mark.clock
-@pytest.mark.deploy
-@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGHUP", "SIGKILL", "SIGINT, planner stopped"])
-def test_however_the_program_ends_the_robot_is_damped_until_it_lies(program, how):
-    """A lost terminal, or a planner that hangs, is no reason to leave it alone."""
-    program.until("hybrid foot")
-    time.sleep(1.0)
-    if "planner" in how:
-        os.kill(program.child("deploy.planner"), signal.SIGSTOP)
-    program.commands.take()
-    with prompt():
-        program.process.send_signal(signal.Signals[how.split(",")[0]])
-        told = time.monotonic()
-        first, gap = damped(program, 2.5)
-    assert first - told < 0.1
-    assert gap < 0.05
-    if how == "SIGKILL":  # nobody is left to write a summary
-        program.process.communicate(timeout=60)
-        program.gone(20.0)
-    else:
-        program.end()
-
-
-@pytest.mark.deploy
-def test_the_foot_stand_goes_on_without_the_planner(program):
-    program.until("hybrid foot")
-    control, planner = (os.sched_getaffinity(program.child(f"deploy.{name}")) for name in ("loop", "planner"))
-    if len(os.sched_getaffinity(0)) > 1:
-        assert len(control) == 1
-        assert not control & planner
-    os.kill(program.child("deploy.planner"), signal.SIGKILL)
-    time.sleep(5.0)
-    program.process.send_signal(signal.SIGINT)
-    summary = program.end()
-    assert summary["stages_true"]["foot_stand"]
-    assert summary["reasons"][-1] == "the program was told to end"
-
-
-@pytest.mark.deploy
-def test_a_controller_that_was_stopped_stays_silent_when_it_wakes_up(program):
-    program.until("hybrid foot")
-    control = program.child("deploy.loop")
-    os.kill(control, signal.SIGSTOP)
-    time.sleep(0.5)
-    program.commands.take()
-    os.kill(control, signal.SIGCONT)
-    time.sleep(0.2)
-    frames = program.commands.take()
-    awake = [frame for frame in frames if decode_command(frame).motors.kp.any()]
-    assert len(awake) <= 1  # what it was about to send when it was stopped
-    assert "hung" in str(program.end()["reasons"])
-
-
-@pytest.mark.deploy
-def test_ctrl_c_and_a_dry_run(tmp_path):
-    run = Run(tmp_path, "--dry-run")
-    run.until("lie")
-    run.process.send_signal(signal.SIGINT)
-    summary = run.end()
-    assert run.commands.take() == []
-    assert int(str(summary["ticks"])) > 10
-    assert summary["end"] == "damping"

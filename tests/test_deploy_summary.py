@@ -12,7 +12,7 @@ import pytest
 from deploy import memory, so3, timing
 from deploy.ekf import N, R, V
 from deploy.memory import Memory
-from deploy.summary import accuracy
+from deploy.summary import _percentiles, accuracy, responses
 from deploy.timing import Stolen
 from hmc.go2.stances import FOOTSTAND
 
@@ -77,6 +77,17 @@ def test_the_estimate_against_the_truth(tmp_path, heading):
     }
     assert found == pytest.approx(expected, abs=0.006)
     assert accuracy(tmp_path / "truth.npz", ticks[4:]) is None
+
+
+def test_what_the_stand_in_was_late_is_not_the_deployments(tmp_path):
+    """Of three states one leaves 5 ms late; the commands follow 1, 1.5 and 4 ms after their states."""
+    np.savez(tmp_path / "truth.npz", tick=[20, 40, 60], left=[7.020, 7.045, 7.060])
+    ticks = [{"ms": ms, "left": left} for ms, left in ((20, 7.021), (40, 7.0465), (60, 7.064), (999, 8.0))]
+    own, response = responses(tmp_path / "truth.npz", ticks)
+    assert response == pytest.approx([1.0, 1.5, 4.0])
+    assert own == pytest.approx([0.0, 0.5, 3.0])
+    assert _percentiles(own) == pytest.approx({"p50": 0.5, "p99": 2.95, "p99.9": 2.995, "max": 3.0})
+    assert _percentiles([]) is None
 
 
 def test_time_that_the_host_took(tmp_path, monkeypatch):

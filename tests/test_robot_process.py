@@ -30,7 +30,7 @@ from hmc.go2 import model as go2
 from tools.go2_robot import main
 from tools.robot.motors import hold
 from tools.robot.orders import obey
-from tools.robot.process import Args, Clock, Log, run
+from tools.robot.process import LATEST, Args, Clock, Log, run
 from tools.robot.standin import Settings, StandIn, Truth, ideal
 
 ROOT = Path(__file__).parent.parent
@@ -119,6 +119,11 @@ def test_a_controller_meets_it(tmp_path: Path) -> None:
         assert truth["qpos"].shape == (len(truth["tick"]), 19)
         assert (np.diff(truth["tick"].astype(int)) == 2).all()
         assert truth["qpos"][-1, 2] > 0.2
+        assert (np.diff(truth["left"]) > 0).all()
+        assert (
+            truth["left"][-1] - truth["left"][0]
+            > 0.001 * float(truth["tick"][-1] - truth["tick"][0]) - LATEST
+        )
 
 
 def test_lockstep_is_the_class_to_the_byte() -> None:
@@ -196,13 +201,14 @@ def test_a_long_log_leaves_the_garbage_collector_nothing_to_walk_over(tmp_path: 
     before = len(gc.get_objects())
     for _ in range(Log.BLOCK + 10):
         robot.step([])
-        log.add(robot.truth())
+        log.add(robot.truth(), robot.time)
         kept = [*kept[-1:], robot.truth()]
     gc.collect()
     assert len(gc.get_objects()) < before + 200
     log.write()
     with np.load(tmp_path / "truth.npz") as found:
-        assert set(found) == set(Truth._fields)
+        assert set(found) == {*Truth._fields, "left"}
+        assert found["left"][-1] == robot.time
         assert (np.diff(found["tick"].astype(int)) == 2).all()
         for name in Truth._fields:
             assert len(found[name]) == Log.BLOCK + 10

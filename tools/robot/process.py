@@ -64,6 +64,7 @@ TRUTH = np.dtype(
         ("released", np.bool_),
         ("accepted", np.int64),
         ("refused", np.int64),
+        ("left", np.float64),  # when its state frame left, by this machine's monotonic clock [s]
     ]
 )
 
@@ -82,22 +83,22 @@ class Log:
         self._blocks: list[NDArray[Any]] = []
         self._steps = 0
 
-    def add(self, truth: Truth) -> None:
-        """Keep a step."""
+    def add(self, truth: Truth, left: float) -> None:
+        """Keep a step, whose state frame left then [s]."""
         if self._path is None:
             return
         at = self._steps % self.BLOCK
         if at == 0:
             self._blocks.append(np.zeros(self.BLOCK, TRUTH))
-        self._blocks[-1][at] = tuple(truth)
+        self._blocks[-1][at] = (*truth, left)
         self._steps += 1
 
     def write(self) -> None:
-        """Write the file: an array (steps, ...) for each field of `Truth`."""
+        """Write the file: an array (steps, ...) for each field of TRUTH."""
         if self._path is not None and self._steps:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             steps = np.concatenate(self._blocks)[: self._steps]
-            columns: dict[str, Any] = {name: steps[name] for name in Truth._fields}
+            columns: dict[str, Any] = {name: steps[name] for name in TRUTH.names or ()}
             np.savez(self._path, **columns)  # compressed, half an hour takes longer than anybody waits for it
 
 
@@ -122,7 +123,7 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
     remote = link.publisher("rt/wirelesscontroller", WirelessController_)
     switcher = MotionSwitcherService(link, "" if robot.released else CONTROLLER)
     desk, log = Desk(args.port), Log(args.log)
-    outgoing = robot.step([])
+    outgoing, truth = robot.step([]), robot.truth()
     where = f"domain {args.domain} on {args.interface}, orders at UDP port {desk.port}"
     say(f"ready: {where}, {priority()}")
     clock = Clock(PERIOD / args.speed)
@@ -131,6 +132,7 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
             clock.wait()
         for frame in outgoing:  # measured now, and worked out before: a robot's clock waits for nothing
             states.write(frame)
+        left = time.monotonic()
         switcher.serve()
         robot.release(switcher.name == "")
         desk.serve(robot)
@@ -140,9 +142,8 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
                 continue
         else:
             frames = commands.take()
-        outgoing = robot.step(frames)
-        truth = robot.truth()
-        log.add(truth)
+        log.add(truth, left)
+        outgoing, truth = robot.step(frames), robot.truth()
         if truth.tick % 20 == 0:
             remote.write(_pressed(robot).serialize(use_version_2=False))
     desk.close()
