@@ -9,6 +9,7 @@ from pathlib import Path
 
 WARM = 20.0  # s after which what is made on first use has been made
 EVERY = 5.0  # s
+WINDOW = 12  # looks: a writer's buffers come and go within a minute
 _PAGE = 4096 / 2**20  # MiB
 
 
@@ -21,8 +22,7 @@ class Memory:
 
     def __init__(self, processes: Mapping[str, int]):
         self._processes = dict(processes)
-        self._first: dict[str, float] = {}
-        self._last: dict[str, float] = {}
+        self._seen: dict[str, list[float]] = {}
         self._next = time.monotonic() + WARM
 
     def look(self) -> None:
@@ -33,10 +33,9 @@ class Memory:
         for name, number in self._processes.items():
             with suppress(OSError, ValueError, IndexError):  # it has just ended
                 pages = int(Path(f"/proc/{number}/statm").read_text().split()[1])
-                self._last[name] = round(_PAGE * pages, 1)
-                self._first.setdefault(name, self._last[name])
+                self._seen.setdefault(name, []).append(round(_PAGE * pages, 1))
 
     @property
     def found(self) -> dict[str, tuple[float, float]]:
-        """Of each process, what it took once it was warm, and at the end [MiB]; empty for a short run."""
-        return {name: (first, self._last[name]) for name, first in self._first.items()}
+        """Of each process, the most in the first minute that it was warm, and in the last one [MiB]."""
+        return {name: (max(seen[:WINDOW]), max(seen[-WINDOW:])) for name, seen in self._seen.items()}

@@ -20,6 +20,7 @@ from hmc.go2.stances import FOOTSTAND
 def test_memory_is_looked_at_once_it_is_warm(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("deploy.memory.time.monotonic", lambda: now[0])
+    monkeypatch.setattr(memory, "WINDOW", 1)
     it = Memory({"this": os.getpid(), "none": 2**22 - 1})
     it.look()
     assert it.found == {}
@@ -35,6 +36,27 @@ def test_memory_is_looked_at_once_it_is_warm(monkeypatch):
     assert 100 < last - first < 300
     assert "none" not in it.found
     assert kept.any()
+
+
+def test_memory_is_the_most_in_a_minute(monkeypatch):
+    """What is taken for a moment at the start or the end is no growth; 1 MiB more is."""
+    now = [0.0]
+    monkeypatch.setattr("deploy.memory.time.monotonic", lambda: now[0])
+    it = Memory({"this": 1})
+    pages = [
+        1000,
+        2000,
+        *[1000] * (memory.WINDOW - 2),
+        *[1500] * 20,
+        1000,
+        2256,
+        *[1000] * (memory.WINDOW - 2),
+    ]
+    for number in pages:
+        monkeypatch.setattr("deploy.memory.Path.read_text", lambda _, number=number: f"9 {number} 9")
+        now[0] += memory.WARM
+        it.look()
+    assert it.found["this"] == pytest.approx((2000 / 256, 2256 / 256), abs=0.06)
 
 
 @pytest.mark.parametrize("heading", [0.0, 2.0])
