@@ -143,8 +143,6 @@ def stand_in(args: Args, domain: int) -> Iterator[Port]:
     """The stand-in as a process, lying; its truth goes to truth.npz when it ends."""
     command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--parent", str(os.getpid())]
     command += ["--log", str((args.out / "truth.npz").absolute()), *args.stand_in]
-    if args.real_time and allowed() and (core := share_cores()[0]) is not None:
-        command += ["--core", str(core)]
     # a session of its own: Ctrl-C is ours to pass on, when the robot has been damped
     process = subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True, start_new_session=True

@@ -30,7 +30,7 @@ from hmc.go2 import model as go2
 from tools.go2_robot import main
 from tools.robot.motors import hold
 from tools.robot.orders import obey
-from tools.robot.process import AWAY, BEHIND, FIRST, LATEST, ROW, Args, Clock, Log, Seat, run
+from tools.robot.process import LATEST, Args, Clock, Log, run
 from tools.robot.standin import Settings, StandIn, Truth, ideal
 
 ROOT = Path(__file__).parent.parent
@@ -165,7 +165,7 @@ def test_states_leave_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
         monkeypatch.setattr(of, name, noted)
 
-    monkeypatch.setattr("tools.robot.process.real_time", lambda _: False)
+    monkeypatch.setattr("tools.robot.process.priority", lambda: "the test's own priority")
     note(Clock, "wait", "wait")
     note(Publisher, "write", "state")
     note(StandIn, "step", "step")
@@ -173,32 +173,6 @@ def test_states_leave_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     turns = len(done) // 3
     assert turns > 20
     assert done == ["step", *["wait", "state", "step"] * turns]
-
-
-def test_it_leaves_the_control_process_s_core_where_two_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    where: list[set[int]] = []
-    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: where.append(cores))
-    monkeypatch.setattr("tools.robot.process.share_cores", lambda: (3, {0, 1, 2}))
-    Seat(None, quick=False).keep(1.0, 0.0)
-    assert where == []
-    Seat(None, quick=True).keep(1.0, 0.0)
-    assert where == [{0, 1, 2}]
-    seat, now, wait = Seat(3, quick=True), 100.0, FIRST
-    where.clear()
-    for late in [2 * BEHIND] * (ROW - 1) + [0.0] + [2 * BEHIND] * (ROW - 1):
-        seat.keep(late, now)
-    assert where == []  # a tick now and then takes longer
-    for _ in range(10):
-        for _ in range(ROW):
-            seat.keep(2 * BEHIND, now)
-        assert where == [{0, 1, 2}]
-        seat.keep(0.0, now + wait)
-        assert where == [{0, 1, 2}]
-        now, wait = now + wait + 1e-6, min(2 * wait, AWAY)
-        seat.keep(2 * BEHIND, now)
-        assert where == [{0, 1, 2}, {3}]
-        where.clear()
-        seat.keep(0.0, now)
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,6 @@ CONTROLLER = "mcf"  # what the motion switcher calls the robot's own controller
 PRIORITY = 40
 COMPANY = 0.3  # s that other robots get to be found
 LATEST = 0.05  # s behind the clock, at most; then the robot loses time instead of hurrying after it
-BEHIND, ROW = 0.0005, 5  # s; so many steps in a row that begin later than that: two do not fit on a core
-FIRST, AWAY = 1.0, 60.0  # s until that is tried again, twice as long each time, up to the second
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,6 @@ class Args:
         speed: of its clock: 0.5 takes 2 s for one of its own, where the machine is too slow for more.
         lockstep: wait for a command after every state instead of keeping time: for tests that repeat.
         parent: number of the process that started it and without which it ends; 0 for none.
-        core: of a control process with a higher real-time priority; None: it has none, or is elsewhere.
     """
 
     robot: Settings = field(default_factory=Settings)
@@ -55,7 +52,6 @@ class Args:
     speed: float = 1.0
     lockstep: bool = False
     parent: int = 0
-    core: int | None = None
 
 
 TRUTH = np.dtype(
@@ -129,13 +125,11 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
     desk, log = Desk(args.port), Log(args.log)
     outgoing, truth = robot.step([]), robot.truth()
     where = f"domain {args.domain} on {args.interface}, orders at UDP port {desk.port}"
-    quick = real_time(PRIORITY)
-    how = "real-time priority" if quick else "normal priority (real-time needs CAP_SYS_NICE)"
-    say(f"ready: {where}, {how}")
-    clock, seat = Clock(PERIOD / args.speed), Seat(args.core if quick else None, quick)
+    say(f"ready: {where}, {priority()}")
+    clock = Clock(PERIOD / args.speed)
     while robot.time < args.seconds and not stopped():
         if not args.lockstep:
-            seat.keep(clock.wait(), time.monotonic())
+            clock.wait()
         left = time.monotonic()
         for frame in outgoing:  # measured now, and worked out before: a robot's clock waits for nothing
             states.write(frame)
@@ -172,36 +166,16 @@ def _pressed(robot: StandIn) -> WirelessController_:
     return WirelessController_(lx, ly, rx, ry, int(robot.remote.buttons))
 
 
-class Seat:
-    """Which cores the stand-in runs on.
+def priority() -> str:
+    """Ask the kernel for real-time priority, and say what came of it.
 
-    It has a part in the control process's core, which takes it from the stand-in whenever it wants: so the
-    planner has the others to itself, as it has beside a robot. When the two do not fit there, the stand-in
-    leaves to the others for a while. Without a part in that core it stays off it.
-
-    Args:
-        core: of the control process; None for no part in it.
-        quick: whether the stand-in has real-time priority; without, it takes what is free.
+    With it, the stand-in stays off the control process's core, in which a robot has no part either. Without
+    it, it takes what is free.
     """
-
-    def __init__(self, core: int | None, quick: bool):
-        self._core, self._others = core, share_cores()[1]
-        self._row, self._away = 0, False  # steps in a row that began late
-        self._until, self._wait = 0.0, FIRST  # when it comes back [s], and after how long the next time [s]
-        if quick:
-            os.sched_setaffinity(0, self._others if core is None else {core})
-
-    def keep(self, late: float, now: float) -> None:
-        """Stay or go, before a step that begins so late [s], `now` [s]."""
-        if self._core is None:
-            return
-        self._row = self._row + 1 if late > BEHIND else 0
-        if not self._away and self._row >= ROW:
-            os.sched_setaffinity(0, self._others)
-            self._away, self._until, self._wait = True, now + self._wait, min(2 * self._wait, AWAY)
-        elif self._away and now > self._until:
-            os.sched_setaffinity(0, {self._core})
-            self._away, self._row = False, 0
+    if real_time(PRIORITY):
+        os.sched_setaffinity(0, share_cores()[1])
+        return "real-time priority"
+    return "normal priority (real-time needs CAP_SYS_NICE)"
 
 
 class Clock:
@@ -212,8 +186,8 @@ class Clock:
         self._next = time.monotonic()
         self._late: list[float] = []
 
-    def wait(self) -> float:
-        """Until the next step is due; how late it begins [s]."""
+    def wait(self) -> None:
+        """Until the next step is due."""
         self._next += self._period
         now = time.monotonic()
         if now < self._next:
@@ -223,7 +197,6 @@ class Clock:
         self._late.append(late)
         if late > LATEST:
             self._next = now
-        return late
 
     def report(self) -> str:
         """Lateness of the steps."""
