@@ -244,8 +244,8 @@ def plan(
             count in `coverage`.
         moves: further draws beside each batch that move a stretch of the schedule, or one of its ends
             (`hmc.moves.moves`); they do not count either.
-        iterations: at most this many improvements are accepted, each of one switch or, where `pairs` or `moves`
-            found it, of two; None for as many as there are.
+        iterations: at most this many improvements are accepted, of one switch each, or of two that `pairs` or
+            `moves` found; None for as many as there are.
         budget: limits on draws, control steps and seconds.
         tolerance: a switch counts if it lowers the cost by more than this share of it.
         seed: of the draws.
