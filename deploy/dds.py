@@ -191,7 +191,7 @@ class Link:
             topic: its name.
             ours: numbers of processes on this machine that may.
             most: publishers, of any topic, that are looked at for the first time in this call: each takes
-                0.1 ms, and a robot has hundreds. Those that are known take nothing.
+                0.1 ms, and a robot may have hundreds.
         """
         _follow(self._publications, self._writers, most)
         _follow(self._participants, self._present, _ALL)  # after their publishers, which nobody then lacks

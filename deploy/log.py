@@ -45,6 +45,7 @@ TICK = np.dtype(
     [
         ("k", "i8"),
         ("ms", "i8"),  # the robot's clock
+        ("due", "i8"),  # when the step was due by it: before that, where states were lost or came late
         ("phase", "i4"),
         ("mode", "i4"),
         ("plan", "i8"),

@@ -276,7 +276,7 @@ class Loop:
             performer.mode,
         )
         tick["plan"], tick["late"], tick["compute"] = plan.number if plan else 0, late, 1e3 * (left - now)
-        tick["left"] = left
+        tick["due"], tick["left"] = control.due_ms, left
         tick["u"] = np.nan_to_num(control.target)
         tick["anew"] = round(1e3 * max(control.estimator.anew, -0.001))
         if estimate is not None:

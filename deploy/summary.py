@@ -72,16 +72,17 @@ def responses(path: Path, ticks: list[dict[str, Any]]) -> tuple[list[float], lis
     """What of a tick's time is the deployment's own, where the stand-in's log says when its states left.
 
     Returns:
-        How late each tick is, as `deploy.timing.Lateness` has it, but for what the stand-in was late with its
-        state; and the time from when that left until the command did [ms].
+        How late each tick is, as `deploy.timing.Lateness` has it, but for what the stand-in was late with the
+        state that was due; and the time from when that left until the command did [ms]. Delays that the
+        stand-in was told to have count as on the way.
     """
     with np.load(path) as truth:
         left = dict(zip(truth["tick"].tolist(), truth["left"].tolist(), strict=True))
     lateness, own, response = Lateness(), [], []
     for tick in ticks:
-        if tick["ms"] in left:
-            own.append(lateness.add(left[tick["ms"]], tick["left"]))
-            response.append(1e3 * (tick["left"] - left[tick["ms"]]))
+        if tick["due"] in left:
+            own.append(lateness.add(left[tick["due"]], tick["left"]))
+            response.append(1e3 * (tick["left"] - left[tick["due"]]))
     return own, response
 
 

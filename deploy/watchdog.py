@@ -94,7 +94,8 @@ class Watchdog:
         """
         heart = self._board.heart.read()
         # a control process that has commanded nothing yet leaves the robot as it is
-        self.needed = heart is not None and bool(heart["commanding"])
+        if heart is not None:
+            self.needed = bool(heart["commanding"])
         if not self.reason and heart is not None and self.needed:
             if heart["t"] != self._silence.heard:
                 self._silence.hear(float(heart["t"]))

@@ -45,6 +45,8 @@ class Running:
         else:
             memory = self.memory[None]
         action, memory = chosen.act(x[None], u[None], memory, step)
-        self.u, self.memory, self.mode = action[0].to(x.dtype), memory[0].to(x.dtype), mode
+        # copies: the mode may use its tensors again, for a planner's rollouts in between
+        self.u, self.memory = (part[0].to(x.dtype, copy=True) for part in (action, memory))
+        self.mode = mode
         self.ran = (self.ran or 0) + 1
         return self.u.clone()

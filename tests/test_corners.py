@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hmc import Budget, Cost, Evaluator, Mode, PlanInterrupted, Rules, Schedule, make_start, plan
+from hmc import Budget, Cost, Evaluator, Mode, ModeSet, PlanInterrupted, Rules, Schedule, make_start, plan
+from hmc.running import Running
 from hmc.solvers import Search
 from hmc.tasks.cartpole import CartpoleCfg, cartpole, initial_state
 from tests.toy import Bad, Damp, Push, Ramp, all_schedules, slow_cost, toy_task
@@ -109,6 +110,20 @@ def test_a_mode_may_work_in_place(cheap, others):
         evaluator.follow(Schedule((len(others),) * 5))
         found.append(evaluator.costs(rows))
     assert torch.equal(*found)
+
+
+def test_what_a_robot_s_mode_remembers_is_its_own_copy():
+    """Between two of its steps a planner rolls the same mode out, in the same buffers."""
+    mode = InPlace()
+    running = Running(ModeSet([mode]))
+    x, u = torch.tensor([0.4, -0.2], dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    for step in range(1, 4):
+        running.act(0, x, u, step)
+        mode.act(x[None], u[None], torch.full((1, 1), 7.0, dtype=torch.float64), torch.tensor([0]))
+        assert running.memory is not None
+        assert running.u is not None
+        assert running.memory.tolist() == [step]
+        assert running.u.tolist() == pytest.approx([0.3 * step - 0.4])
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -104,7 +104,7 @@ def test_the_estimate_against_the_truth(tmp_path, heading):
 def test_what_the_stand_in_was_late_is_not_the_deployments(tmp_path):
     """Of three states one leaves 5 ms late; the commands follow 1, 1.5 and 4 ms after their states."""
     np.savez(tmp_path / "truth.npz", tick=[20, 40, 60], left=[7.020, 7.045, 7.060])
-    ticks = [{"ms": ms, "left": left} for ms, left in ((20, 7.021), (40, 7.0465), (60, 7.064), (999, 8.0))]
+    ticks = [{"due": ms, "left": left} for ms, left in ((20, 7.021), (40, 7.0465), (60, 7.064), (999, 8.0))]
     own, response = responses(tmp_path / "truth.npz", ticks)
     assert response == pytest.approx([1.0, 1.5, 4.0])
     assert own == pytest.approx([0.0, 0.5, 3.0])

@@ -64,7 +64,8 @@ TRUTH = np.dtype(
         ("released", np.bool_),
         ("accepted", np.int64),
         ("refused", np.int64),
-        ("left", np.float64),  # when its state frame left, by this machine's monotonic clock [s]
+        # when its state frame left, but for delays and faults, by this machine's monotonic clock [s]
+        ("left", np.float64),
     ]
 )
 
