@@ -9,7 +9,6 @@ import numpy as np
 
 from deploy.checks import StateChecks
 from deploy.codec import FOC, JOINTS, MotorCommand, RobotState, encode_command
-from deploy.ekf import PHI, V
 from deploy.estimate import Estimate
 from deploy.estimator import Estimator
 from deploy.modes import NAMES, NONE, Performer
@@ -276,6 +275,9 @@ class Control:
 
 
 def uncertainty(estimate: Estimate) -> tuple[float, float]:
-    """Standard deviations of velocity [m/s] and tilt [rad], of the axis where they are largest."""
-    speed, tilt = estimate.P[V, V], estimate.P[PHI, PHI][:2, :2]
+    """Standard deviations of velocity [m/s] and tilt [rad], of the axis where they are largest.
+
+    Of velocity in the body frame: in the world's, a heading that nobody can know makes a jump's unknown.
+    """
+    speed, tilt = estimate.velocity_covariance(), estimate.tilt_covariance()
     return math.sqrt(max(speed.diagonal().max(), 0.0)), math.sqrt(max(tilt.diagonal().max(), 0.0))

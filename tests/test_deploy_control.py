@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from deploy.codec import VELOCITY_STOP, RobotState, decode_command, decode_state, encode_state
-from deploy.control import TICK, Control
+from deploy.control import TICK, Control, uncertainty
+from deploy.ekf import N, V
+from deploy.estimate import Estimate
 from deploy.loop import policies
 from deploy.remote import Button, Remote, pack
 from deploy.safety import PEAK_TORQUE, Phase
@@ -226,3 +228,22 @@ def test_single_bad_frames_disturb_nothing():
     assert all(rig.held[-100:])
     counts = rig.control.checks.counts
     assert min(counts[name] for name in ("checksum", "not a number", "repeated", "out of order", "gap")) > 0
+
+
+def test_an_unknown_heading_is_no_unknown_velocity():
+    """After half an hour on two legs nobody knows the heading: a jump at 1.5 m/s was damped for it."""
+    x, P = np.zeros(37), 1e-4 * np.eye(N)
+    x[3], x[19:22] = 1.0, (1.5, 0.2, 0.3)
+    turned = np.zeros(N)
+    turned[2], turned[V] = 2.0, np.cross([0.0, 0.0, 2.0], x[19:22])  # by 2 rad, and the velocity with it
+    none, nobody = np.zeros(3), np.zeros(4, dtype=bool)
+
+    def speed(P: np.ndarray) -> float:
+        return uncertainty(Estimate(0.0, x, np.eye(3), none, none, nobody, nobody, P, 0.0))[0]
+
+    known = P + np.outer(turned, turned)
+    assert np.sqrt(known[V, V].diagonal().max()) > 2.9
+    assert speed(known) == pytest.approx(speed(P), rel=1e-6)
+    assert 0.01 <= speed(P) < 0.02
+    P[V, V] += np.eye(3)
+    assert speed(P + np.outer(turned, turned)) == pytest.approx(1.0, abs=1e-3)
