@@ -36,12 +36,8 @@ from hmc.cli import command_line, one_line_errors  # noqa: E402
 
 LOOK = 0.05  # s
 START_UP = 60.0  # s for a process to be ready
-ENDING = (
-    signal.SIGINT,
-    signal.SIGTERM,
-    signal.SIGHUP,
-    signal.SIGQUIT,
-)  # what ends a run: a lost terminal, too
+# what ends a run: a lost terminal, too
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 @dataclass(frozen=True)

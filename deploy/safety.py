@@ -142,7 +142,7 @@ class Body:
         up: world z of each body axis, (3,).
         height: of the base [m]; NaN: unknown.
         q, dq, tau: of the joints [rad], [rad/s], [N m], (12,).
-        velocity_std: of the estimated velocity [m/s]; 0 where nothing rests on it.
+        velocity_std: of the estimated velocity in the body frame [m/s]; 0 where nothing rests on it.
         tilt_std: of the estimated attitude [rad]; likewise.
     """
 

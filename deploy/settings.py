@@ -55,7 +55,7 @@ class EnvelopeCfg:
         joint_low, joint_high: of hip, thigh and calf of every leg [rad]; by default more than they can.
         joint_speed: at most [rad/s].
         torque: of a joint, relative to its motor's peak, at most.
-        velocity_std: of the estimated velocity, at most [m/s].
+        velocity_std: of the estimated velocity in the body frame, at most [m/s].
         tilt_std: of the estimated attitude, at most [deg].
         patience: how long a limit may be exceeded [s].
     """
