@@ -16,17 +16,17 @@ from train.runner import read_checkpoint
 def test_torchrun_gives_each_process_its_own_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    args = ppo.Args("handstand", seed=5)
-    assert ppo.under_torchrun(args) is args
+    args = ppo.Args("handstand")
+    assert ppo.under_torchrun(args, 5) == (args, 5)
     for key, value in {"WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2", "RANK": "3", "LOCAL_RANK": "1"}.items():
         monkeypatch.setenv(key, value)
-    mine = ppo.under_torchrun(args)
-    assert (mine.device, mine.seed) == ("cuda:1", 3005)
+    mine, seed = ppo.under_torchrun(args, 5)
+    assert (mine.device, seed) == ("cuda:1", 3005)
     with pytest.raises(ValueError, match="a GPU of its own: leave --device cuda:0 out"):
-        ppo.under_torchrun(ppo.Args("handstand", device="cuda:0"))
+        ppo.under_torchrun(ppo.Args("handstand", device="cuda:0"), 5)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     with pytest.raises(ValueError, match="4 processes here for 2: take --nproc-per-node=2"):
-        ppo.under_torchrun(args)
+        ppo.under_torchrun(args, 5)
 
 
 def test_two_processes_train_together(tmp_path):

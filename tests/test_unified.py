@@ -136,9 +136,15 @@ def test_advantages_of_each_goal_have_its_own_scale(tmp_path):
     for goal in (-1.0, 1.0):
         own = storage.advantages[..., 0][command == goal]
         assert float(own.mean()) == pytest.approx(0.0, abs=1e-5)
-        assert float(own.std()) == pytest.approx(1.0, abs=1e-4)
+        assert float(own.std(unbiased=False)) == pytest.approx(1.0, abs=1e-4)
         returns = storage.returns[..., 0][command == goal]
         assert torch.equal(own.argsort(), returns.argsort()), "what is better stays better"
+    command = torch.full((6, 8), 1.0)
+    command[2, 3] = -1.0
+    storage.observations["policy"][..., OBS_SIZE] = command
+    runner.alg.compute_returns(runner.env.get_observations())
+    assert storage.advantages.isfinite().all(), "a goal of one sample has no scale"
+    assert storage.advantages[2, 3] == 0
 
 
 def test_it_is_trained_exported_and_played(tmp_path):
@@ -150,7 +156,11 @@ def test_it_is_trained_exported_and_played(tmp_path):
     assert any(not torch.equal(*pair) for pair in zip(before, runner.alg.actor.parameters(), strict=True))
     checkpoint = tmp_path / "model_0.pt"
     runner.save(str(checkpoint))
+    with pytest.raises(ValueError, match="of mode unified judges a state and a command"):
+        export(checkpoint, tmp_path / "value.onnx", value=True)
+    assert not list(tmp_path.glob("*.onnx"))
     export(checkpoint, tmp_path / "unified.onnx")
+    assert [path.name for path in tmp_path.glob("*.onnx")] == ["unified.onnx"]
     env = runner.env
     obs = env.get_observations()["policy"]
     with torch.no_grad():

@@ -86,52 +86,64 @@ class _Deterministic(nn.Module):
 
 
 def export(checkpoint: Path, out: Path, *, value: bool = False) -> None:
-    """Write the policy of a checkpoint, or its value, to `out`; it appears only when complete and checked."""
+    """Write the policy of a checkpoint, or its value, to `out`; it appears only when complete and checked.
+
+    Raises:
+        ValueError: the checkpoint cannot be read, or a value is asked for where a command decides it too.
+    """
     data = read_checkpoint(checkpoint)
     meta = data["infos"]["meta"]
     config = portable(json.loads(meta["config"]))
     mode = config["env"]["mode"]
     command = COMMANDS.get(mode, ())
-    shift = TOWARDS[None] / config["env"]["action_scale"] if mode == "unified" and not value else None
+    if value and command:
+        raise ValueError(
+            f"checkpoint {checkpoint}: the critic of mode {mode} judges a state and a command "
+            f"({', '.join(command)}): --value wants a mode without one"
+        )
+    shift = TOWARDS[None] / config["env"]["action_scale"] if mode == "unified" else None
     module = _Deterministic(critic_of(data) if value else actor_of(data), shift).eval()
     size = OBS_SIZE + len(command) + (VALUE_EXTRA if value else 0)
     partial = out.with_suffix(".partial.onnx")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
-    with redirect_stdout(io.StringIO()), warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # torch about itself
-        torch.onnx.export(
-            module,
-            (torch.zeros(2, size),),
-            str(partial),
-            input_names=["obs"],
-            output_names=["value" if value else "actions"],
-            dynamic_shapes=({0: torch.export.Dim("batch")},),
-            external_data=False,
-            dynamo=True,
-            verbose=False,
-        )
-    model = onnx.load(str(partial))
-    fields = {
-        **contract(),
-        "mode": mode,
-        "value": value,
-        "command": list(command),
-        "default_pose": [round(float(v), 6) for v in HOLDS[mode].pose],
-        "action_scale": config["env"]["action_scale"],
-        "training_command": shlex.join(portable(shlex.split(meta["command"]))),
-        "training_seed": int(meta["seed"]),
-        "training_config": config,
-        "training_config_sha256": config_hash(config),
-        "environment_steps": int(data["infos"]["steps"]),
-    }
-    del model.metadata_props[:]
-    for part in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
-        del part.metadata_props[:]  # stack traces, with the folders of this machine
-    for key, entry in fields.items():
-        model.metadata_props.add(key=key, value=json.dumps(entry))
-    onnx.save(model, str(partial))
-    (Value if value else Network)(partial)  # refuses what it would refuse later
-    os.replace(partial, out)
+    try:
+        with redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # torch about itself
+            torch.onnx.export(
+                module,
+                (torch.zeros(2, size),),
+                str(partial),
+                input_names=["obs"],
+                output_names=["value" if value else "actions"],
+                dynamic_shapes=({0: torch.export.Dim("batch")},),
+                external_data=False,
+                dynamo=True,
+                verbose=False,
+            )
+        model = onnx.load(str(partial))
+        fields = {
+            **contract(),
+            "mode": mode,
+            "value": value,
+            "command": list(command),
+            "default_pose": [round(float(v), 6) for v in HOLDS[mode].pose],
+            "action_scale": config["env"]["action_scale"],
+            "training_command": shlex.join(portable(shlex.split(meta["command"]))),
+            "training_seed": int(meta["seed"]),
+            "training_config": config,
+            "training_config_sha256": config_hash(config),
+            "environment_steps": int(data["infos"]["steps"]),
+        }
+        del model.metadata_props[:]
+        for part in (*model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
+            del part.metadata_props[:]  # stack traces, with the folders of this machine
+        for key, entry in fields.items():
+            model.metadata_props.add(key=key, value=json.dumps(entry))
+        onnx.save(model, str(partial))
+        (Value if value else Network)(partial)  # refuses what it would refuse later
+        os.replace(partial, out)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def main(checkpoint: Path, out: Path, /, value: bool = False) -> None:

@@ -21,7 +21,7 @@ from hmc.sim.make import choose  # noqa: E402
 from train.config import metadata, read_training, rsl_config  # noqa: E402
 from train.env import Go2Env  # noqa: E402
 from train.make import make_env  # noqa: E402
-from train.runner import Runner  # noqa: E402
+from train.runner import Runner, read_checkpoint  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Args:
         engine: auto takes MuJoCo Warp where a GPU is there, else C MuJoCo.
         device: of engine and networks, such as cpu or cuda:0; auto takes a GPU if there is one.
         threads: of the C engine and of torch; 0 for all cores.
-        seed: of everything random.
+        seed: of everything random; 1 if not given. A run that goes on keeps the seed that it began with.
         deterministic: on a GPU, let torch and the engine do what they can for the same seed to give the same
             policy, slower; what the engine lacks for that is in docs/scale.md. On a CPU with one number of
             threads it always does.
         out: folder for checkpoints and logs; default out/train/MODE or out/train/MODE_STAGE.
         resume: go on from the latest checkpoint in `out`, or from the file given by --checkpoint.
         checkpoint: a file to begin from (weights, optimiser, curriculum).
-        iterations: overrides the configuration's.
+        iterations: overrides ppo.iterations.
         set: overrides, such as env.rewards.power=0.001.
         play: a checkpoint to record an episode of, instead of training.
     """
@@ -52,7 +52,7 @@ class Args:
     engine: Literal["auto", "mujoco", "warp"] = "auto"
     device: str = "auto"
     threads: int = 0
-    seed: int = 1
+    seed: int | None = None
     deterministic: bool = False
     out: Path | None = None
     resume: bool = False
@@ -72,14 +72,31 @@ class Args:
         return self.out or ROOT / "out" / "train" / self.name
 
 
-def under_torchrun(args: Args) -> Args:
-    """Under torchrun each process has a GPU and a seed of its own; else the arguments as they are.
+def seed_of(args: Args, goes_on: Path | None = None) -> int:
+    """The seed of a new run, or of the one whose checkpoint goes on: it drew that one's robots.
+
+    Raises:
+        ValueError: another one is asked for.
+    """
+    if goes_on is None:
+        return 1 if args.seed is None else args.seed
+    own = int(read_checkpoint(goes_on)["infos"]["meta"]["seed"])
+    if args.seed not in (None, own):
+        raise ValueError(
+            f"--seed {args.seed}: the run of {goes_on} has the seed {own}, which drew its robots: leave "
+            "--seed out to go on with it, or begin another run"
+        )
+    return own
+
+
+def under_torchrun(args: Args, seed: int) -> tuple[Args, int]:
+    """Under torchrun each process has a GPU and a seed of its own; else arguments and seed as they are.
 
     Raises:
         ValueError: there is not a GPU for each process of this machine.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return args
+        return args, seed
     gpus, processes = torch.cuda.device_count(), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if not torch.cuda.is_available():
         raise ValueError(
@@ -93,7 +110,7 @@ def under_torchrun(args: Args) -> Args:
     if args.device != "auto":
         raise ValueError(f"torchrun gives each process a GPU of its own: leave --device {args.device} out")
     rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
-    return replace(args, device=f"cuda:{local}", seed=args.seed + 1000 * rank)
+    return replace(args, device=f"cuda:{local}"), seed + 1000 * rank
 
 
 def set_up(args: Args, argv: Sequence[str] | None = None) -> Runner:
@@ -104,8 +121,12 @@ def set_up(args: Args, argv: Sequence[str] | None = None) -> Runner:
         argv: the command line that asks for it, which the policy will name; None for this program's.
     """
     cfg = read_training(args.mode, args.name, args.set)
-    args = under_torchrun(args)
-    torch.manual_seed(args.seed)
+    if args.iterations is not None:
+        cfg = replace(cfg, ppo=replace(cfg.ppo, iterations=args.iterations))
+    checkpoint = args.checkpoint or (args.folder / "latest.pt" if args.resume else None)
+    new_stage = bool(args.stage) and not args.resume
+    args, seed = under_torchrun(args, seed_of(args, None if new_stage else checkpoint))
+    torch.manual_seed(seed)
     if args.deterministic:
         # the engine follows torch; cuBLAS wants this set before its first call
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -113,15 +134,14 @@ def set_up(args: Args, argv: Sequence[str] | None = None) -> Runner:
     if args.threads:
         torch.set_num_threads(args.threads)
     device = None if args.device == "auto" else args.device
-    env = make_env(cfg.env, args.engine, device=device, threads=args.threads, seed=args.seed)
-    meta = metadata(cfg, sys.argv[1:] if argv is None else argv, args.seed)
+    env = make_env(cfg.env, args.engine, device=device, threads=args.threads, seed=seed)
+    meta = metadata(cfg, sys.argv[1:] if argv is None else argv, seed)
     runner = Runner(env, rsl_config(cfg.ppo), str(args.folder), str(env.device), meta)
-    checkpoint = args.checkpoint or (args.folder / "latest.pt" if args.resume else None)
-    if args.stage and not args.resume:
+    if new_stage:
         runner.begin_with(str(checkpoint or ROOT / "out" / "train" / args.mode / "latest.pt"))
     elif checkpoint is not None:
         runner.resume(str(checkpoint))
-    runner.last_iteration = args.iterations or cfg.ppo.iterations
+    runner.last_iteration = cfg.ppo.iterations
     runner.anneal = cfg.ppo.anneal
     runner.final_std, runner.settle = cfg.ppo.final_std, cfg.ppo.settle
     runner.set_learning_rate(runner.current_learning_iteration)
@@ -171,7 +191,7 @@ def main(args: Args) -> None:
         from train.play import play
 
         with one_line_errors():
-            print(play(args.play, args.mode, args.folder, seed=args.seed, threads=args.threads))
+            print(play(args.play, args.mode, args.folder, seed=seed_of(args), threads=args.threads))
         return
     with one_line_errors():
         runner = set_up(args)

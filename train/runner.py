@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import math
 import os
 import random
@@ -120,6 +121,9 @@ class Runner(OnPolicyRunner):
     def _restore(self, path: str, *, everything: bool) -> dict[str, Any]:
         """Networks, curriculum and counts of a checkpoint, or everything; its further contents."""
         infos: dict[str, Any] = read_checkpoint(path)["infos"]
+        mode = json.loads(infos["meta"]["config"])["env"]["mode"]
+        if mode != self.env.cfg.mode:
+            raise ValueError(f"checkpoint {path}: it is of mode {mode}; expected {self.env.cfg.mode}")
         what = {"actor": True, "critic": True, "optimizer": everything, "iteration": everything}
         try:
             self.load(path, what, map_location=self.device)
@@ -130,7 +134,10 @@ class Runner(OnPolicyRunner):
             ) from error
         self._fuse()
         self.logger.tot_timesteps, self.logger.tot_time = infos["steps"], infos["seconds"]
-        self.env.starts.load_state_dict(infos["starts"])
+        try:
+            self.env.starts.load_state_dict(infos["starts"])
+        except ValueError as error:
+            raise ValueError(f"checkpoint {path}: {error}") from None
         return infos
 
     def set_learning_rate(self, iteration: int) -> None:

@@ -165,7 +165,17 @@ class Starts:
         return {"success": self.success, "rates": self.rates}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint."""
+        """Go on from a checkpoint.
+
+        Raises:
+            ValueError: its way is longer or shorter.
+        """
+        places = len(state["success"])
+        if places != self.places:
+            raise ValueError(
+                f"its starts on the way to the {self.stance.name} begin at {1 - places * self.WIDTH:.1f}; "
+                f"expected {self.cfg.furthest}: set furthest of the starts as it was"
+            )
         self._ahead = None
         self.success.copy_(state["success"])
         self.rates.copy_(state["rates"])

@@ -137,7 +137,7 @@ class GoalPpo(PPO):
         for goal in command.unique():
             mine = command == goal
             own = advantages[mine]
-            advantages[mine] = (own - own.mean()) / (own.std() + 1e-8)
+            advantages[mine] = (own - own.mean()) / (own.std(unbiased=False) + 1e-8)
 
 
 class UnifiedEnv(Go2Env):
