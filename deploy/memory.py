@@ -10,11 +10,13 @@ from pathlib import Path
 WARM = 20.0  # s after which what is made on first use has been made
 EVERY = 5.0  # s
 WINDOW = 12  # looks: a writer's buffers come and go within a minute
-_PAGE = 4096 / 2**20  # MiB
 
 
 class Memory:
-    """Resident memory of processes, looked at now and then.
+    """The most resident memory that processes take within a minute.
+
+    The kernel keeps the most, looked at now and then: a buffer of some MB that is there for a hundredth of a
+    second counts each time, and not by chance.
 
     Args:
         processes: names and numbers of them.
@@ -22,7 +24,8 @@ class Memory:
 
     def __init__(self, processes: Mapping[str, int]):
         self._processes = dict(processes)
-        self._seen: dict[str, list[float]] = {}
+        self._peaks: dict[str, list[float]] = {}  # of each minute
+        self._looks = 0
         self._next = time.monotonic() + WARM
 
     def look(self) -> None:
@@ -31,11 +34,28 @@ class Memory:
             return
         self._next = now + EVERY
         for name, number in self._processes.items():
+            peaks = self._peaks.setdefault(name, [])
             with suppress(OSError, ValueError, IndexError):  # it has just ended
-                pages = int(Path(f"/proc/{number}/statm").read_text().split()[1])
-                self._seen.setdefault(name, []).append(round(_PAGE * pages, 1))
+                if self._looks > 0:
+                    peaks[-1] = _peak(number)
+                if self._looks % WINDOW == 0:
+                    _forget(number)
+                    peaks.append(_peak(number))
+        self._looks += 1
 
     @property
     def found(self) -> dict[str, tuple[float, float]]:
-        """Of each process, the most in the first minute that it was warm, and in the last one [MiB]."""
-        return {name: (max(seen[:WINDOW]), max(seen[-WINDOW:])) for name, seen in self._seen.items()}
+        """Of each process, the most in the first minute once it was warm, and in the last two [MiB]."""
+        return {name: (peaks[0], max(peaks[-2:])) for name, peaks in self._peaks.items() if peaks}
+
+
+def _peak(process: int) -> float:
+    """The most resident memory since `_forget` [MiB]."""
+    status = Path(f"/proc/{process}/status").read_text()
+    return round(int(status.split("VmHWM:")[1].split()[0]) / 1024, 1)
+
+
+def _forget(process: int) -> None:
+    """Let the kernel's most begin anew."""
+    with suppress(OSError):  # where that is not permitted, it is the most since the beginning
+        Path(f"/proc/{process}/clear_refs").write_text("5")
