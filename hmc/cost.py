@@ -47,19 +47,31 @@ class Cost:
         if not self.stage:
             return x.new_zeros(len(x), 0)
         if self.on_cpu is not None and x.device.type == "cpu" and x.dtype == torch.float64:
-            return self.on_cpu(x, u, u_prev, k)
-        return torch.stack([f(x, u, u_prev, k) for f in self.stage.values()]).T
+            return _checked("cost on_cpu", self.on_cpu(x, u, u_prev, k), (len(x), len(self.stage)))
+        return torch.stack([_term(name, f(x, u, u_prev, k), x) for name, f in self.stage.items()]).T
 
     def terminal_terms(self, x: Tensor, k: Tensor) -> Tensor:
         """Terminal terms in order of `terminal`, (n, number of terminal terms)."""
         if not self.terminal:
             return x.new_zeros(len(x), 0)
-        return torch.stack([f(x, k) for f in self.terminal.values()]).T
+        return torch.stack([_term(name, f(x, k), x) for name, f in self.terminal.items()]).T
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all terms, stage terms first."""
         return (*self.stage, *self.terminal)
+
+
+def _term(name: str, found: Tensor, x: Tensor) -> Tensor:
+    return _checked(f"cost term {name!r}", found, (len(x),))
+
+
+def _checked(what: str, found: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """What a user's function made of n states, if it is of the shape that is asked for."""
+    if not isinstance(found, Tensor) or found.shape != shape:
+        got = tuple(found.shape) if isinstance(found, Tensor) else repr(found)
+        raise ValueError(f"{what}: expected a tensor of shape {shape} for {shape[0]} states, got {got}")
+    return found
 
 
 def total(terms: Tensor) -> Tensor:

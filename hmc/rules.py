@@ -122,5 +122,11 @@ class Rules:
             if len(found) > 0:
                 rows = upload(found, x.device)
                 bad = torch.zeros(len(x), dtype=torch.bool, device=x.device) if bad is None else bad
-                bad[rows] = ~guard(x.index_select(0, rows), torch.full_like(rows, k))
+                may = guard(x.index_select(0, rows), torch.full_like(rows, k))
+                if not isinstance(may, Tensor) or may.dtype != torch.bool or may.shape != rows.shape:
+                    got = f"{may.dtype} {tuple(may.shape)}" if isinstance(may, Tensor) else repr(may)
+                    raise ValueError(
+                        f"rules.guards of mode {name!r}: expected a tensor of bool, ({len(rows)},), got {got}"
+                    )
+                bad[rows] = ~may
         return bad

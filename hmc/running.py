@@ -40,13 +40,11 @@ class Running:
         chosen = self.modes[mode]
         step = torch.tensor([k], device=x.device)
         if self.memory is None or mode != self.mode:
-            self.ran = 0
-            memory = chosen.reset(x[None], u[None], step)
+            ran, memory = 1, chosen.reset(x[None], u[None], step)
         else:
-            memory = self.memory[None]
+            ran, memory = (self.ran or 0) + 1, self.memory[None]
         action, memory = chosen.act(x[None], u[None], memory, step)
         # copies: the mode may use its tensors again, for a planner's rollouts in between
-        self.u, self.memory = (part[0].to(x.dtype, copy=True) for part in (action, memory))
-        self.mode = mode
-        self.ran = (self.ran or 0) + 1
-        return self.u.clone()
+        action, memory = (part[0].to(x.dtype, copy=True) for part in (action, memory))
+        self.mode, self.ran, self.memory, self.u = mode, ran, memory, action  # or none, if the mode fails
+        return action.clone()

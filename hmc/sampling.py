@@ -336,7 +336,7 @@ class SamplingMpc(Mode):
         """
         noise = self._noise(k, iteration, x) * (self.cfg.noise if std is None else std[:, None])
         plans = theta[:, None] + self._along_basis(noise)
-        costs = torch.nan_to_num(self._rollout(x, u, plans, k), nan=torch.inf)
+        costs = self._rollout(x, u, plans, k).nan_to_num(torch.inf, torch.inf, torch.inf)
         move, std = METHODS[self.cfg.method](self.cfg, noise, costs)
         return theta + self._along_basis(move), std, (plans, costs)
 

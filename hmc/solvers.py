@@ -131,7 +131,7 @@ class Search:
         With `beside`, also what takes two switches, of which the first alone need not improve, and the costs
         of that: see `hmc.moves`. All of it is rolled out together, which takes least time.
         """
-        waiting, size = torch.empty(0, dtype=torch.long), self.samples
+        waiting, size, batch_number = torch.empty(0, dtype=torch.long), self.samples, 0
         if self.best.costs:
             self.evaluator.follow(self.schedule)
         else:
@@ -142,7 +142,7 @@ class Search:
             if room <= 0:  # what would be tried beside it is not worked out
                 self.stopped_by = limit
                 return
-            pairs = self._pairs(room) if beside else []
+            pairs = self._pairs(room, batch_number) if beside else []
             single = self.space.neighbours(self.schedule, waiting[:room])
             batch: Tensor | Neighbours = single
             if pairs:
@@ -168,7 +168,7 @@ class Search:
             if self.stopped_by or not known.all():
                 self.stopped_by = self.stopped_by or "seconds"
                 return
-            size = max(self.samples, min(2 * size, self.max_samples))
+            size, batch_number = max(self.samples, min(2 * size, self.max_samples)), batch_number + 1
             self.tell()
 
     def offer(self, switches: Sequence[Switch], cost: float, equal: bool = False) -> None:
@@ -189,11 +189,11 @@ class Search:
                 (*best.steps, (tuple(switches), terms)),
             )
 
-    def _pairs(self, ahead: int) -> Pairs:
-        """What is tried beside a batch of `ahead` draws."""
+    def _pairs(self, ahead: int, number: int) -> Pairs:
+        """What is tried beside the batch of this number since the last improvement, of `ahead` draws."""
         k = self.evaluator.start.k
-        room = self.meter.room(ahead + self.pairs + self.moves)[0] - ahead
-        tried = handovers(self.space, k, k + len(self.best.switches), min(self.pairs, room))
+        room = max(0, self.meter.room(ahead + self.pairs + self.moves)[0] - ahead)
+        tried = handovers(self.space, k, k + len(self.best.switches) + number, min(self.pairs, room))
         return tried + moves(self.schedule, self.rng, min(self.moves, room - len(tried)))
 
     def _stitched(self, switches: Sequence[Switch]) -> Schedule:

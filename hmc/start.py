@@ -62,6 +62,8 @@ def make_start(
     if mode is None:
         if memory is not None:
             raise ValueError("memory was given without the mode it belongs to: pass mode= as well")
+        if ran is not None:
+            raise ValueError(f"ran={ran} was given without the mode that ran so long: pass mode= as well")
         return Start(x, u, None, x.new_zeros(0), k, snapshot)
     if ran is not None and ran < 0:
         raise ValueError(f"task {task.name!r}: the mode has been running for ran >= 0 steps, got {ran}")

@@ -12,13 +12,13 @@ A = torch.tensor([[1.0, 0.1], [-0.2, 0.9]], dtype=torch.float64)
 
 
 class Linear:
-    """x' = A x + 0.3 u, elementwise, hence the same in a batch of any size; NaN beyond |x_0| = `edge`."""
+    """x' = A x + 0.3 u, elementwise, hence the same in a batch of any size; `lost` beyond |x_0| = `edge`."""
 
     nx, nu, dt = 2, 2, 0.5
     device, dtype = torch.device("cpu"), torch.float64
 
-    def __init__(self, num_worlds: int, edge: float = math.inf):
-        self.num_worlds, self.edge = num_worlds, edge
+    def __init__(self, num_worlds: int, edge: float = math.inf, lost: float = math.nan):
+        self.num_worlds, self.edge, self.lost = num_worlds, edge, lost
         self.rows = torch.zeros(num_worlds, 4, dtype=torch.float64)
 
     def x(self, ids=None):
@@ -33,7 +33,7 @@ class Linear:
     def step(self, u, ids=None):
         x = self.x(ids)
         after = x[:, :1] * A[:, 0] + x[:, 1:] * A[:, 1] + 0.3 * u
-        after[after[:, 0].abs() > self.edge] = math.nan
+        after[after[:, 0].abs() > self.edge] = self.lost
         self.reset(after, u, ids)
 
     def save(self, ids=None):

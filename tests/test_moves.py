@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from unittest import mock
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from hmc import Cost, ModeSet, Schedule, SwitchSpace, Task, plan
 from hmc.moves import SHIFTS, handovers, moves
+from hmc.tasks.cartpole import CartpoleCfg, cartpole, initial_state
 from tests.toy import Push, ToySim
 
 ALL = 10_000
@@ -122,3 +124,26 @@ def test_a_move_gets_past_what_no_single_switch_improves():
     assert freed.schedule.modes == (0,) * 6 + (1,) * 3 + (0,)
     assert freed.cost < stuck.cost
     assert freed.draws > stuck.draws, "moves are paid for like other draws"
+
+
+def test_each_batch_has_pairs_of_its_own():
+    """Until a schedule improves, what was tried beside a batch before is not tried again."""
+    asked: list[tuple[int, ...]] = []
+
+    def noted(space: SwitchSpace, k: int, position: int, n: int):
+        found = handovers(space, k, position, n)
+        asked.append(tuple(hash(pair) for pair in found))
+        return found
+
+    task = cartpole(CartpoleCfg(horizon=12))
+    best = plan(task, initial_state(), solver="exhaustive").schedule
+    with mock.patch("hmc.solvers.handovers", noted):
+        found = plan(task, initial_state(), schedule=best, samples=64, max_samples=64, pairs=4)
+    assert not found.switches
+    assert len(asked) >= 4
+    assert len(set(asked)) == len(asked)
+
+
+def test_nothing_is_tried_where_there_is_no_room():
+    schedule = Schedule((0,) * 10 + (1,) * 10 + (2,) * 10, NAMES)
+    assert moves(schedule, np.random.default_rng(0), 0) == []

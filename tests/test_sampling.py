@@ -339,9 +339,10 @@ def test_batches_do_not_change_the_jump():
         memory = after
 
 
+@pytest.mark.parametrize("lost", [math.nan, math.inf])
 @pytest.mark.parametrize("method", METHODS)
-def test_where_every_sample_diverges_the_plan_stays(method):
-    mpc = mode(lambda n: Linear(n, edge=1.0), method=method, elites=3, iterations=2)
+def test_where_every_sample_diverges_the_plan_stays(method, lost):
+    mpc = mode(lambda n: Linear(n, 1.0, lost), method=method, elites=3, iterations=2)
     x, u = torch.tensor([[5.0, 0.0]]).double(), torch.tensor([[0.3, -0.2]]).double()
     action, after = mpc.act(x, u, mpc.reset(x, u, torch.tensor([0])), torch.tensor([0]))
     assert torch.equal(action, u)

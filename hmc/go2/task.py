@@ -86,6 +86,17 @@ class JumpCfg:
     mpc: bool = True
     dwell: int = 0
 
+    def __post_init__(self) -> None:
+        if self.spacing < 1 or self.dwell < 0:
+            raise ValueError(
+                f"jump.spacing must be at least 1 and jump.dwell at least 0, got {self.spacing}, {self.dwell}"
+            )
+        for point in self.guess:
+            if len(point) != 4:
+                raise ValueError(
+                    f"jump.guess: each point is front thigh, front calf, rear thigh, rear calf, got {point}"
+                )
+
 
 @dataclass(frozen=True)
 class FlipCfg:

@@ -1,0 +1,134 @@
+"""What users get wrong in a cost, a rule or a start is named; what cannot be judged has no say."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from hmc import Cost, Mode, ModeSet, Rules, make_start, plan
+from hmc.go2.task import JumpCfg
+from hmc.running import Running
+from hmc.sampling import METHODS, SamplingCfg
+from tests.linear import Linear
+from tests.test_sampling import mode, situations
+from tests.toy import Push, Ramp, toy_task
+
+X = [0.3, 0.0]
+
+
+@pytest.mark.parametrize("lost", [math.inf, -math.inf])
+@pytest.mark.parametrize("method", METHODS)
+def test_what_costs_no_number_has_as_little_say_as_nan(method, lost):
+    """A wall written as an infinite cost: a part of the samples runs into it."""
+    x, u, k = situations(20)
+    x *= 0.4
+    moved = [
+        mode(partial(Linear, edge=1.0, lost=value), method=method, elites=3, iterations=2)
+        for value in (math.nan, lost)
+    ]
+    memory = moved[0].reset(x, u, k)
+    found = [each.act(x, u, memory, k)[0] for each in moved]
+    assert torch.equal(*found)
+    assert not torch.equal(found[0], mode(method=method, elites=3, iterations=2).act(x, u, memory, k)[0])
+
+
+def test_mppi_by_hand_with_a_sample_that_has_no_say():
+    cfg = SamplingCfg(samples=3, temperature=0.5)
+    noise = torch.tensor([0.0, 1.0, 50.0], dtype=torch.float64)[None, :, None, None]
+    costs = torch.tensor([[1.0, 0.5, math.inf]], dtype=torch.float64)
+    weight = math.exp(-0.5 / (0.5 * math.sqrt(0.25 / 2)))
+    moved, _ = METHODS["mppi"](cfg, noise, costs)
+    assert float(moved) == pytest.approx(1 / (1 + weight))
+
+
+@pytest.mark.parametrize("cheap", [False, True])
+@pytest.mark.parametrize(
+    ("term", "got"),
+    [
+        (lambda x, u, u_prev, k: u.square(), r"\(\d+, 1\)"),
+        (lambda x, u, u_prev, k: x.square().sum(), r"\(\)"),
+        (lambda x, u, u_prev, k: 1.0, "1.0"),
+    ],
+)
+def test_a_cost_term_of_another_shape_is_named(cheap, term, got):
+    stage = {"place": lambda x, u, u_prev, k: x[:, 0] ** 2, "effort": term}
+    with pytest.raises(ValueError, match=rf"cost term 'effort': expected a tensor of shape .*, got {got}"):
+        plan(toy_task(4, [Push(0.0), Push(1.0)], Cost(stage), cheap=cheap), X)
+    end = Cost({}, {"end": lambda x, k: term(x, x[:, :1], x, k)})
+    with pytest.raises(ValueError, match=rf"cost term 'end': expected a tensor of shape .*, got {got}"):
+        plan(toy_task(4, [Push(0.0), Push(1.0)], end, cheap=cheap), X)
+
+
+def test_terms_in_one_call_are_as_many():
+    cost = Cost(
+        {"one": lambda x, u, u_prev, k: x[:, 0], "two": lambda x, u, u_prev, k: x[:, 1]},
+        on_cpu=lambda x, u, u_prev, k: x[:, :1],
+    )
+    with pytest.raises(ValueError, match=r"cost on_cpu: expected a tensor of shape \(\d+, 2\)"):
+        plan(toy_task(4, [Push(0.0), Push(1.0)], cost), X)
+
+
+@pytest.mark.parametrize("cheap", [False, True])
+@pytest.mark.parametrize(
+    ("says", "got"),
+    [
+        (lambda x, k: True, "True"),
+        (lambda x, k: torch.ones(len(x), 1, dtype=torch.bool), r"torch.bool \(\d+, 1\)"),
+        (lambda x, k: torch.ones(len(x)), r"torch.float32 \(\d+,\)"),
+    ],
+)
+def test_a_guard_that_does_not_say_yes_or_no_of_each_state_is_named(cheap, says, got):
+    """`~True` is -2, which is as good as a no."""
+    task = replace(toy_task(4, [Push(0.0), Push(1.0)], cheap=cheap), rules=Rules(guards={"push1": says}))
+    with pytest.raises(ValueError, match=rf"rules.guards of mode 'push1': expected .* got {got}"):
+        plan(task, X)
+
+
+def test_how_long_no_mode_has_been_running_is_refused():
+    with pytest.raises(ValueError, match="ran=3 was given without the mode that ran"):
+        plan(toy_task(4), X, ran=3)
+    task = toy_task(4)
+    with pytest.raises(ValueError, match="ran=0 was given without the mode that ran"):
+        make_start(task, task.make_sim(1), X, ran=0)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"spacing": 0}, "jump.spacing must be at least 1 .* got 0"),
+        ({"dwell": -1}, "jump.dwell at least 0, got 8, -1"),
+        (
+            {"guess": ((0.1, 0.2, 0.3),)},
+            r"jump.guess: each point is .* \(0.1, 0.2, 0.3\)",
+        ),
+    ],
+)
+def test_a_guess_of_the_jump_that_is_none(given, words):
+    with pytest.raises(ValueError, match=words):
+        JumpCfg(**given)
+
+
+class Failing(Mode):
+    """Never comes to an action."""
+
+    name = "failing"
+
+    def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        raise KeyboardInterrupt
+
+
+def test_a_mode_that_fails_as_it_is_entered_changes_nothing():
+    running = Running(ModeSet([Ramp(), Failing()]))
+    x, u = torch.tensor(X, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    for step in range(5):
+        running.act(0, x, u, step)
+    before = running.mode, running.ran, running.memory, running.u
+    with pytest.raises(KeyboardInterrupt):
+        running.act(1, x, u, 5)
+    assert (running.mode, running.ran, running.memory, running.u) == before
+    assert running.ran == 5
