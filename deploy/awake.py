@@ -23,7 +23,7 @@ def spin() -> None:
 
 def main(job: Job) -> None:
     """Be awake until SIGTERM."""
-    stopped = until_told()
+    stopped = until_told(job.parent)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what waits for a lock hears of no handler
     assert job.core is not None
     os.sched_setaffinity(0, {job.core})

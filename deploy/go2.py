@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ class Args:
         robot: settings of the stand-in, see tools/go2_robot.py, such as state-delay=0.002 states.drop=0.01.
         foot: policy file of the foot stand; default: the one that comes with the package.
         hand: policy file of the handstand, likewise.
-        set: overrides of cfg/deploy.toml, such as plan.lead=100.
+        set: overrides of cfg/deploy.toml, such as plan.expires=50.
         task_set: overrides of the task in cfg/flip.toml, after those of cfg/planner.toml, such as substeps=2.
         search: overrides of cfg/planner.toml, such as search.draws=16.
         threads: of the planner's engine; 0 for one a core that the planner may use.
@@ -135,8 +136,43 @@ class Ended(RuntimeError):
 
 
 @contextlib.contextmanager
-def stand_in(args: Args, domain: int) -> Iterator[Port]:
-    """The stand-in as a process, lying; its truth goes to truth.npz when it ends."""
+def undisturbed() -> Iterator[None]:
+    """What ends a run waits until what is started here is known to those who end it."""
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda it, _: came.append(it)) for number in ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def reserved(folder: Path) -> Iterator[None]:
+    """A folder for this run alone, with nothing of an earlier one.
+
+    Raises:
+        ValueError: another run writes there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"another run writes to {folder}: end it, or take another --out") from None
+        for name in ("run.mcap", "truth.npz", "summary.json"):
+            (folder / name).unlink(missing_ok=True)
+        yield
+    finally:
+        os.close(held)
+
+
+@contextlib.contextmanager
+def stand_in(args: Args, domain: int) -> Iterator[tuple[Port, subprocess.Popen[str]]]:
+    """The stand-in as a process, lying, and its port; its truth goes to truth.npz when it ends."""
     command = [sys.executable, "tools/go2_robot.py", "--domain", str(domain), "--parent", str(os.getpid())]
     command += ["--log", str((args.out / "truth.npz").absolute()), *args.stand_in]
     # a session of its own: Ctrl-C is ours to pass on, when the robot has been damped
@@ -147,7 +183,7 @@ def stand_in(args: Args, domain: int) -> Iterator[Port]:
         port = re.search(r"orders at UDP port (\d+)", _ready(process, "the stand-in"))
         assert port
         orders = Port(int(port[1]))
-        yield orders
+        yield orders, process
         orders.close()
     finally:
         _end(process)
@@ -188,41 +224,56 @@ def _stay_damped(board: Board) -> None:
             signal.signal(number, handler)
 
 
-def run(args: Args, console: Console, port: Port | None) -> Memory:
+def run(
+    args: Args,
+    console: Console,
+    memory: Memory,
+    port: Port | None = None,
+    robot: subprocess.Popen[str] | None = None,
+) -> None:
     """Start all processes, show the run until it is over, end them so that the robot stays damped.
 
     On a robot that is damped, or whose control process has ended, it is over when the operator says so.
 
-    Returns:
-        What memory they took.
+    Args:
+        args: command line.
+        console: to say what happens.
+        memory: told of the processes.
+        port: of the stand-in.
+        robot: the stand-in.
     """
-    board, (source, sink) = Board(), pipe()
-    job = args.job()
-    base = {**vars(job), "board": board.descriptor}
+    board, (source, end) = Board(), pipe()
+    sink = os.fdopen(end, "wb", buffering=0)  # may be closed twice
+    base = {**vars(args.job()), "board": board.descriptor}
     with contextlib.ExitStack() as stack:
         stack.callback(board.close)
         stack.callback(os.sched_setaffinity, 0, os.sched_getaffinity(0))
         base["core"], others = share_cores()
         os.sched_setaffinity(0, others)  # of the view, and of all who are started until they ask for more
-        log = spawn("log", Job(**{**base, "log": source, "path": str(args.out / "run.mcap")}), [source])
-        stack.callback(log.wait)  # it ends when the control process has
-        os.close(source)
         watch: list[subprocess.Popen[str]] = []
-        stack.callback(_end_all, watch)
-        stack.callback(_stay_damped, board)
-        planners: list[subprocess.Popen[str]] = []
-        stack.callback(_end_all, planners)
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE}
-        control = spawn("loop", Job(**{**base, "log": sink}), [board.descriptor, sink], **pipes)
-        os.close(sink)
-        if args.awake and base["core"] is not None and args.real_time and allowed():
-            stack.callback(_end, spawn("awake", Job(**base), []))
-        stack.callback(_end, control)  # before all others, whose end takes its time
+        with undisturbed():
+            log = spawn("log", Job(**{**base, "log": source, "path": str(args.out / "run.mcap")}), [source])
+            os.close(source)
+            stack.callback(log.wait)  # it ends when nobody has the other end of the pipe
+            stack.callback(sink.close)
+            stack.callback(_end_all, watch)
+            stack.callback(_stay_damped, board)
+            planner = spawn("planner", Job(**base), [board.descriptor], **pipes)
+            stack.callback(_end, planner)
+        if robot is None:  # before its own controller is stopped, what is wrong with the settings is said
+            _ready(planner, "the planner")
+        with undisturbed():
+            if args.awake and base["core"] is not None and args.real_time and allowed():
+                stack.callback(_end, spawn("awake", Job(**base), []))
+            job = Job(**{**base, "log": sink.fileno()})
+            control = spawn("loop", job, [board.descriptor, sink.fileno()], **pipes)
+            stack.callback(_end, control)  # before all others, whose end takes its time
+            sink.close()
         console.print(f"control process: {_ready(control, 'the control process').strip()}", highlight=False)
         if not args.dry_run:
-            watch.append(spawn("watchdog", Job(**{**base, "pid": control.pid}), [board.descriptor]))
-        planner = spawn("planner", Job(**base), [board.descriptor])
-        planners.append(planner)
+            with undisturbed():
+                watch.append(spawn("watchdog", Job(**{**base, "pid": control.pid}), [board.descriptor]))
         operator: Presser | None = None
         if port is not None:
             operator = Keyboard(port) if args.keys else Operator(port, args.hold)
@@ -232,29 +283,30 @@ def run(args: Args, console: Console, port: Port | None) -> Memory:
         pids = {"control": control.pid, "planner": planner.pid, "log": log.pid}
         if watch:
             pids["watchdog"] = watch[0].pid
-        memory = Memory(pids)
-        follow(board, control, planner, operator, stack.enter_context(View(console)), memory)
-        if operator is None and not args.dry_run:
+        memory.begin(pids)
+        with View(console) as view:
+            follow(board, (control, robot or control), planner, operator, view, memory)
+        heart = board.heart.read()
+        if operator is None and heart is not None and heart["commanding"]:
             console.print("the control process has ended, the watchdog damps the robot: Ctrl-C ends it")
             signal.pause()
-        return memory
 
 
 def follow(
     board: Board,
-    control: subprocess.Popen[str],
+    needed: Sequence[subprocess.Popen[str]],
     planner: subprocess.Popen[str],
     operator: Presser | None,
     view: View,
     memory: Memory,
 ) -> None:
-    """Show the status until the control process ends, or the operator in simulation says that it is over.
+    """Show the status until a process that is needed ends, or the operator in simulation has seen enough.
 
     Raises:
         Ended: the planner could not start. A robot that moves already is left to its operator.
     """
     phase = Phase.PASSIVE
-    while control.poll() is None:
+    while all(process.poll() is None for process in needed):
         time.sleep(LOOK)
         memory.look()
         status = board.status.read()
@@ -269,48 +321,63 @@ def follow(
             return
 
 
+def checked(args: Args) -> None:
+    """Refuse what can be seen to be wrong before anything is started.
+
+    Raises:
+        ValueError: a setting, a policy's file, or options that do not go together.
+    """
+    load(args.job().cfg, DeployCfg, args.set)
+    policies(args.foot, args.hand)
+    _ = args.stand_in
+    if not 0 < args.speed <= 1 or (args.speed != 1 and not args.simulated):
+        raise ValueError(f"speed is above 0 and at most 1 on the stand-in, 1 on a robot; got {args.speed:g}")
+    if args.keys and not (args.simulated and sys.stdin.isatty()):
+        raise ValueError("--keys needs the stand-in and a terminal: on a robot, the operator has the remote")
+
+
 def main(args: Args) -> int:
     """Run, summarise, return the exit status: 0 for all stages, 1 for fewer, 2 where it could not start."""
-    console = Console()
-    with one_line_errors():
-        load(args.job().cfg, DeployCfg, args.set)
-        policies(args.foot, args.hand)
-        _ = args.stand_in  # what is wrong with it, said before anything is started
-        if not 0 < args.speed <= 1 or (args.speed != 1 and not args.simulated):
-            raise ValueError(
-                f"speed is above 0 and at most 1 on the stand-in, 1 on a robot; got {args.speed:g}"
-            )
-        if args.keys and not (args.simulated and sys.stdin.isatty()):
-            raise ValueError(
-                "--keys needs the stand-in and a terminal: on a robot, the operator has the remote"
-            )
-        args.out.mkdir(parents=True, exist_ok=True)
-        for name in ("run.mcap", "truth.npz", "summary.json"):
-            (args.out / name).unlink(missing_ok=True)
-    truth = args.out / "truth.npz" if args.simulated else None
-    memory, stolen = Memory({}), Stolen()
+    with contextlib.ExitStack() as stack:
+        with one_line_errors():
+            checked(args)
+            stack.enter_context(reserved(args.out))
+        return perform(args)
+
+
+def perform(args: Args) -> int:
+    """As `main`, of arguments that are checked."""
+    console, memory, stolen = Console(), Memory(), Stolen()
+    robot: subprocess.Popen[str] | None = None
     for number in ENDING:
         signal.signal(number, signal.default_int_handler)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             if args.simulated:
-                with stand_in(args, args.job().domain) as port:
-                    memory = run(args, console, port)
+                with stand_in(args, args.job().domain) as (port, robot):
+                    run(args, console, memory, port, robot)
             else:
-                memory = run(args, console, None)
+                run(args, console, memory)
     except Ended as ended:
         if ended.status < 0:  # else the process has said itself what was wrong
             print(f"error: {ended}: a signal, or no memory was left", file=sys.stderr)
         return 2 if ended.status == 2 else 1
+    lost = robot is not None and robot.returncode != 0
+    if robot is not None and lost:
+        print(f"error: the stand-in ended with status {robot.returncode} in the middle", file=sys.stderr)
     from deploy.summary import summarise, write  # loads torch: seconds that the start need not wait for
 
     with one_line_errors():
-        summary = {**summarise(args.out / "run.mcap", truth), "memory_mb": memory.found}
-        summary["stolen"] = share if (share := stolen.share) is None else round(share, 4)
+        truth = args.out / "truth.npz"
+        summary = {
+            **summarise(args.out / "run.mcap", truth if truth.exists() else None),
+            "memory_mb": memory.found,
+            "stolen": share if (share := stolen.share) is None else round(share, 4),
+        }
     write(args.out / "summary.json", summary)
     console.print_json(data=summary)
     reached = summary["stages_true"] if args.simulated else summary["stages"]
-    return 0 if reached and reached["success"] else 1
+    return 0 if reached and reached["success"] and not lost else 1
 
 
 if __name__ == "__main__":

@@ -217,7 +217,7 @@ def about(job: Job) -> dict[str, str]:
 
 def main(job: Job) -> None:
     """Be the log's process until the control process has ended; SIGTERM is not needed and does nothing."""
-    until_told(parent_matters=False)
+    until_told()
     with os.fdopen(job.log, "rb") as source:
         write(source, Path(job.path), about(job))
 

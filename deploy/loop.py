@@ -11,12 +11,13 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from deploy.codec import decode_state
+from deploy.codec import FrameError, RobotState, decode_state
 from deploy.control import Control
 from deploy.dds import Link, LinkError, Subscriber
 from deploy.log import COMMAND, PLAN, STATE, TICK, TICK_RECORD, Recorder
@@ -38,7 +39,7 @@ WAIT = 0.005  # s for a frame
 HEARD = 3.0  # s for the first one
 COMPANY = 0.4  # s for other controllers to be found
 LAST = 0.3  # s of damping before a program that is told to end does
-ROUND = 0.05  # s between two looks for other controllers
+ROUND = 0.05  # s between two looks for other controllers, and words to the view at least
 STRANGERS = 16  # publishers that are new to it, in such a look
 LATE = 0.02  # s after the frames came: who commands only then looks at the watchdog once more
 FOLDED = 0.6  # rad off the pose in which the robot lies, at most, where its own controller may be stopped
@@ -56,8 +57,14 @@ def preflight(link: Link, states: Subscriber, cfg: DeployCfg, release: bool, dry
     Raises:
         Refusal: it is not.
     """
-    frames = states.take(HEARD)
-    if not frames:
+    heard, told, until = 0, list[RobotState](), time.monotonic() + HEARD
+    while not told and (left := until - time.monotonic()) > 0:
+        frames = states.take(left)
+        heard += len(frames)
+        told = [state for frame in frames if (state := _whole(frame)) is not None]
+        if heard and dry_run:
+            return
+    if not heard:
         why = (
             "something publishes rt/lowstate, but is silent: is the robot asleep?"
             if states.peers
@@ -65,9 +72,6 @@ def preflight(link: Link, states: Subscriber, cfg: DeployCfg, release: bool, dry
             "the DDS domain right (0 on the robot's network, 1 on lo for the stand-in)?"
         )
         raise Refusal(f"no state frame within {HEARD:g} s; {why}")
-    if dry_run:
-        return
-    told = [state for frame in frames if (state := decode_state(frame)).crc_ok]
     if not told:
         raise Refusal("no state frame has a right checksum: is this a Go2?")
     time.sleep(COMPANY)
@@ -89,6 +93,14 @@ def preflight(link: Link, states: Subscriber, cfg: DeployCfg, release: bool, dry
             raise Refusal(f"the robot's own controller {name!r} runs: lay the robot down, then use --release")
     except MotionSwitcherError as error:
         raise Refusal(str(error)) from None
+
+
+def _whole(frame: bytes) -> RobotState | None:
+    """The state in a frame that came undamaged."""
+    with suppress(FrameError):
+        if (state := decode_state(frame)).crc_ok:
+            return state
+    return None
 
 
 class Loop:
@@ -125,6 +137,7 @@ class Loop:
         self._planned = 0.0  # when it was [s]
         self._quiet = ""  # that there are no plans any more
         self._company = 0.0  # when other controllers were looked for [s]
+        self._shown = 0.0  # when the view was told [s]
         self._began = time.monotonic()
         self._silent = False
         self._guard = Silence(cfg.lost, cfg.stall, WAIT)  # of the watchdog
@@ -160,10 +173,14 @@ class Loop:
         elif board.plan.count != self._plans:
             self._planned = now
             self._take()
-        elif now - self._company > ROUND:
+        elif now - self._company > ROUND and not self._dry_run:
             self._company = now
             self._look_around()
-        if control.phase != self._phase or control.machine.hint != self._hint:
+        changed = control.phase != self._phase or control.machine.hint != self._hint
+        if ticked or changed or now - self._shown > ROUND:  # without state frames there are no ticks
+            self._shown = now
+            self._show(left)
+        if changed:
             self._phase, self._hint = control.phase, control.machine.hint
             why = control.machine.reason or self._hint
             self._recorder.event("phase", phase=self._phase.name.lower(), k=control.k, reason=why)
@@ -236,7 +253,7 @@ class Loop:
         self._recorder.add(PLAN, json.dumps(fields).encode())
 
     def _tell(self, now: float, left: float) -> None:
-        """Tell planner, view and log of a tick."""
+        """Tell planner and log of a tick."""
         control, performer = self._control, self._control.performer
         late = self._lateness.add(0.001 * control.due_ms / self._speed, left)
         quiet = control.phase == Phase.HYBRID and now - self._planned > _SILENT / self._speed
@@ -246,8 +263,25 @@ class Loop:
         if control.phase == Phase.HYBRID:
             control.situation["t"] = now
             self._board.state.write(control.situation)
-        estimate, status = control.estimate, self._board.status.blank()
-        plan = performer.plan
+        estimate, plan, tick = control.estimate, performer.plan, np.zeros((), TICK)
+        tick["k"], tick["ms"], tick["phase"], tick["mode"] = (
+            control.k,
+            control.checks.ms,
+            control.phase,
+            performer.mode,
+        )
+        tick["plan"], tick["late"], tick["compute"] = plan.number if plan else 0, late, 1e3 * (left - now)
+        tick["due"], tick["left"] = control.due_ms, left
+        tick["u"] = np.nan_to_num(control.target)
+        tick["anew"] = round(1e3 * max(control.estimator.anew, -0.001))
+        if estimate is not None:
+            tick["x"], tick["variance"], tick["contact"] = estimate.x, estimate.P.diagonal(), estimate.contact
+        self._recorder.add(TICK_RECORD, tick.tobytes())
+
+    def _show(self, left: float) -> None:
+        """Tell the view."""
+        control, performer, status = self._control, self._control.performer, self._board.status.blank()
+        estimate, plan = control.estimate, performer.plan
         status["t"], status["k"], status["phase"], status["mode"] = (
             left,
             control.k,
@@ -268,20 +302,6 @@ class Loop:
         if estimate is not None:
             status["pitch"], status["height"] = np.degrees(pitch(estimate.C[2])), estimate.x[2]
         self._board.status.write(status)
-        tick = np.zeros((), TICK)
-        tick["k"], tick["ms"], tick["phase"], tick["mode"] = (
-            control.k,
-            control.checks.ms,
-            control.phase,
-            performer.mode,
-        )
-        tick["plan"], tick["late"], tick["compute"] = plan.number if plan else 0, late, 1e3 * (left - now)
-        tick["due"], tick["left"] = control.due_ms, left
-        tick["u"] = np.nan_to_num(control.target)
-        tick["anew"] = round(1e3 * max(control.estimator.anew, -0.001))
-        if estimate is not None:
-            tick["x"], tick["variance"], tick["contact"] = estimate.x, estimate.P.diagonal(), estimate.contact
-        self._recorder.add(TICK_RECORD, tick.tobytes())
 
     def end(self) -> None:
         """Damp the robot for a moment and say how it went; then the watchdog damps it."""
@@ -332,7 +352,7 @@ def run(job: Job, stopped: Callable[[], bool]) -> None:
 
 def main(job: Job) -> int:
     """Be the control process until SIGTERM; exit status 2 and one line if the robot cannot be started."""
-    stopped = until_told()
+    stopped = until_told(job.parent)
     if job.core is not None:
         os.sched_setaffinity(0, {job.core})
     try:

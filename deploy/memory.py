@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,16 +18,17 @@ class Memory:
 
     The kernel keeps the most, looked at now and then: a buffer of some MB that is there for a hundredth of a
     second counts each time, and not by chance.
-
-    Args:
-        processes: names and numbers of them.
     """
 
-    def __init__(self, processes: Mapping[str, int]):
-        self._processes = dict(processes)
+    def __init__(self) -> None:
+        self._processes: dict[str, int] = {}
         self._peaks: dict[str, list[float]] = {}  # of each minute
         self._looks = 0
-        self._next = time.monotonic() + WARM
+        self._next = math.inf
+
+    def begin(self, processes: Mapping[str, int]) -> None:
+        """Look at these from when they are warm, by name; their numbers."""
+        self._processes, self._next = dict(processes), time.monotonic() + WARM
 
     def look(self) -> None:
         """Look, if it is time for it."""

@@ -280,7 +280,6 @@ class Planner:
 
 def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
     """Plan for every new state until `stopped()`."""
-    planner.warm()
     last = -1
     while not stopped():
         state = board.state.read()
@@ -320,16 +319,18 @@ def planner_of(job: Job) -> Planner:
 
 def main(job: Job) -> int:
     """Be the planner until SIGTERM; exit status 2 and one line if it is asked for what it cannot do."""
-    stopped = until_told()
+    stopped = until_told(job.parent)
     if not (job.real_time and allowed()):
         os.nice(NICE)
     torch.set_num_threads(1)
     cores = len(os.sched_getaffinity(0))  # the engine would have a thread for each core of the machine
     try:
         planner = planner_of(replace(job, threads=job.threads or cores))
+        planner.warm()
     except ValueError as error:
         print(f"planner: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    print("ready", flush=True)
     run(Board(job.board), planner, stopped)
     return 0
 

@@ -47,6 +47,7 @@ class Job:
         speed: of the robot's clock; not 1 in slow motion alone.
         real_time: ask the kernel for real-time priority.
         core: of the control process; None for any.
+        parent: number of the process that started it; `spawn` sets it.
     """
 
     board: int = -1
@@ -69,6 +70,7 @@ class Job:
     speed: float = 1.0
     real_time: bool = True
     core: int | None = None
+    parent: int = 0
 
 
 def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> subprocess.Popen[str]:
@@ -80,7 +82,7 @@ def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> 
     paths: dict[str, Any] = {
         name: str(Path(path).absolute()) for name in _PATHS if (path := getattr(job, name))
     }
-    job = replace(job, **paths)
+    job = replace(job, parent=os.getpid(), **paths)
     command = [sys.executable, "-m", f"deploy.{module}", json.dumps(asdict(job))]
     return subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, pass_fds=descriptors, text=True, start_new_session=True, **streams
@@ -96,19 +98,20 @@ def told() -> Job:
     return Job(**values)
 
 
-def until_told(parent_matters: bool = True) -> Callable[[], bool]:
+def until_told(parent: int = 0) -> Callable[[], bool]:
     """Whether SIGTERM has come; the terminal's Ctrl-C and its loss are the parent's business.
 
     Args:
-        parent_matters: whether the parent's death counts as SIGTERM: no process outlives the program.
+        parent: number of the process whose death counts as SIGTERM, so that this one does not outlive the
+            program; 0 for none. In a container it may well be process 1.
     """
     came: list[int] = []
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
-    if parent_matters:
+    if parent:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() == 1:
+        if os.getppid() != parent:
             came.append(signal.SIGTERM)
     return lambda: bool(came)
 

@@ -122,15 +122,16 @@ def watch(
     period: float,
     stopped: Callable[[], bool],
     after: float,
+    parent: int,
 ) -> None:
     """Watch the process of this number; publish the frame from the latch on.
 
     When `stopped()`, it ends, but not while it is needed, nor before the robot was damped for DAMPED seconds:
     whoever ends a group of processes tells this one and the control process at once. It ends `after` seconds
-    after it has lost its parent, or has latched since.
+    after it has lost the process `parent` that started it, or has latched since.
     """
-    parent, now = os.getppid(), time.monotonic()
-    orphaned, damped = now if parent == 1 else math.inf, math.inf
+    now = time.monotonic()
+    orphaned, damped = now if os.getppid() != parent else math.inf, math.inf
     it, gone = Process(pid), False
     while not (stopped() and (now - damped > DAMPED if watchdog.reason else not watchdog.needed)):
         time.sleep(period)
@@ -148,7 +149,7 @@ def watch(
 
 def main(job: Job) -> None:
     """Be the watchdog until SIGTERM, see `watch`."""
-    stopped = until_told(parent_matters=False)
+    stopped = until_told()
     cfg = load(job.cfg, DeployCfg, job.set)
     watchdog = Watchdog(Board(job.board), cfg.watchdog)
     publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
@@ -156,7 +157,7 @@ def main(job: Job) -> None:
         os.sched_setaffinity(0, {*os.sched_getaffinity(0), job.core})
     real_time(PRIORITY, job.real_time)  # now only: making a link takes 70 ms of a core
     period, after = cfg.watchdog.period, cfg.watchdog.after
-    watch(watchdog, job.pid, publisher, damping(cfg.output.damping), period, stopped, after)
+    watch(watchdog, job.pid, publisher, damping(cfg.output.damping), period, stopped, after, job.parent)
 
 
 if __name__ == "__main__":

@@ -211,7 +211,7 @@ def test_plans_are_made_with_the_policies_that_run(tmp_path: Path) -> None:
 def test_what_cannot_be_planned_is_one_line(
     wrong: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.planner.until_told", lambda: lambda: True)
+    monkeypatch.setattr("deploy.planner.until_told", lambda _: lambda: True)
     monkeypatch.setattr("os.nice", lambda _: 0)
     assert main(Job(**wrong)) == 2
     _, err = capsys.readouterr()

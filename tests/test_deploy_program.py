@@ -194,3 +194,27 @@ def test_ctrl_c_and_a_dry_run(tmp_path):
     assert run.commands.take() == []
     assert int(str(summary["ticks"])) > 10
     assert summary["end"] == "damping"
+
+
+@pytest.mark.deploy
+def test_the_run_is_over_when_the_stand_in_is_gone(tmp_path):
+    run = Run(tmp_path)
+    run.until("hybrid foot")
+    os.kill(run.child("go2_robot"), signal.SIGKILL)
+    began = time.monotonic()
+    summary = run.end()
+    assert time.monotonic() - began < 20
+    assert run.process.returncode == 1
+    assert summary["stages_true"] is None
+    assert int(str(summary["ticks"])) > 100
+
+
+@pytest.mark.deploy
+def test_a_second_run_leaves_the_first_ones_files_alone(program):
+    program.until("lie")
+    command = [sys.executable, "deploy/go2.py", "--domain", str(DOMAIN + 1), "--out", str(program.out)]
+    other = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert other.returncode == 2
+    assert "another run writes to" in other.stderr
+    program.process.send_signal(signal.SIGINT)
+    assert program.end()["memory_mb"] is not None

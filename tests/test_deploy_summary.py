@@ -21,7 +21,9 @@ def test_memory_is_the_most_in_a_minute_once_it_is_warm(monkeypatch):
     """What is taken for a moment counts in its minute, whenever somebody looks; what is kept counts on."""
     now = [0.0]
     monkeypatch.setattr("deploy.memory.time.monotonic", lambda: now[0])
-    it = Memory({"this": os.getpid(), "none": 2**22 - 1})
+    it = Memory()
+    it.look()  # nothing is there to look at yet
+    it.begin({"this": os.getpid(), "none": 2**22 - 1})
 
     def after(seconds: float) -> None:
         now[0] += seconds
