@@ -73,7 +73,7 @@ class StateChecks:
         if first:
             self.ms = state.tick
         else:
-            self.counts["gap"] += ahead // 2 - 1
+            self.counts["gap"] += max(0, ahead // 2 - 1)  # steps of 1 and 3 ms lose nothing
             self.ms += ahead
         self._silence.hear(now)
         if state.remote != ABSENT or self._remote is None:

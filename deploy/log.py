@@ -20,12 +20,12 @@ import os
 import struct
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.reader import McapReader, make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
 from deploy.ekf import N
@@ -146,18 +146,28 @@ def tick_fields(tick: Any) -> dict[str, Any]:
 def read(path: Path) -> Iterator[tuple[str, float, Any]]:
     """Topic, wall clock [s] and content of each record of a log: octets of frames, objects of JSON.
 
+    They come as they were written, whatever was done to the clock meanwhile.
+
     Raises:
         LogError: not a log of this version; names what it is.
     """
-    with _opened(path) as (reader, _):
+    metadata(path)  # or it is no such log
+    with path.open("rb") as file:
         try:
-            for _, channel, message in reader.iter_messages():
-                is_json = channel.message_encoding == "json"
+            summary = make_reader(file).get_summary()
+            whole = summary.statistics.message_count if summary and summary.statistics else 0
+            file.seek(0)
+            # the reader that seeks has all of a log in memory, unless it goes by the clock
+            reader, count = NonSeekingReader(file, validate_crcs=True), 0
+            for _, channel, message in reader.iter_messages(log_time_order=False):
+                is_json, count = channel.message_encoding == "json", count + 1
                 yield (
                     channel.topic,
                     1e-9 * message.log_time,
                     json.loads(message.data) if is_json else message.data,
                 )
+            if count != whole:  # this reader passes over a chunk that looks like none
+                raise ValueError(f"has {count} records, expected {whole}")
         except Exception as error:
             raise LogError(f"log {path}: damaged ({type(error).__name__} {error})") from None
 
@@ -168,31 +178,21 @@ def metadata(path: Path) -> dict[str, str]:
     Raises:
         LogError: not a log of this version; names what it is.
     """
-    with _opened(path) as (_, found):
-        return found
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[McapReader, dict[str, str]]]:
-    """A log's reader and metadata."""
     if not path.is_file():
         raise LogError(f"log {path}: no such file")
     with path.open("rb") as file:
         try:
-            reader = make_reader(file)
-            records = {record.name: record.metadata for record in reader.iter_metadata()}
+            records = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
         except Exception as error:  # mcap and its decompressors have no type in common for damage
             raise LogError(
                 f"log {path}: not a whole MCAP file ({type(error).__name__} {error}): a run that was cut "
                 "short leaves one that `mcap recover` can mend"
             ) from None
-        if (found := records.get(METADATA)) is None:
-            raise LogError(f"log {path}: an MCAP file of another program: give a run.mcap of deploy/go2.py")
-        if (version := found.get("version", "none")) != VERSION:
-            raise LogError(
-                f"log {path}: is of version {version}, expected {VERSION}: take the hmc that wrote it"
-            )
-        yield reader, found
+    if (found := records.get(METADATA)) is None:
+        raise LogError(f"log {path}: an MCAP file of another program: give a run.mcap of deploy/go2.py")
+    if (version := found.get("version", "none")) != VERSION:
+        raise LogError(f"log {path}: is of version {version}, expected {VERSION}: take the hmc that wrote it")
+    return found
 
 
 def _schema(kind: int) -> bytes:

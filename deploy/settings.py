@@ -1,12 +1,48 @@
-"""cfg/deploy.toml as frozen dataclasses: limits, ramps and times of the deployment, with their units."""
+"""cfg/deploy.toml as frozen dataclasses: limits, ramps and times of the deployment, with their units.
+
+What a Go2 cannot be told in earnest, such as a negative gain, is a ValueError that names the setting.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from deploy.slots import STEPS
+from hmc.go2 import facts
+
+_TIME = 0.001, 3600.0  # s
+_MAYBE = 0.0, 3600.0  # s, of what may be left out
+_READING = 0.0, 1000.0  # of any sensor
+_KP, _KD = (0.0, 200.0), (0.0, 20.0)  # N m/rad, N m s/rad: several times what stands it up
+_STEP = 0.001, 2 * math.pi  # rad, at most more than a joint has
+_TURN = -2 * math.pi, 2 * math.pi  # rad
+_KINDS = ("hip", "thigh", "calf")
+_LOWEST = tuple(max(facts.Q_LOWER[i::3]) for i in range(3))  # that every leg can [rad]
+_HIGHEST = tuple(min(facts.Q_UPPER[i::3]) for i in range(3))
+
+
+def _within(name: str, value: float, low: float, high: float) -> None:
+    """A setting may be either end of its range; NaN is never within."""
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be {low:g} to {high:g}, got {value:g}")
+
+
+def _check(cfg: object, limits: tuple[float, float], *names: str) -> None:
+    """Whether fields, or all that each holds, are within the same range."""
+    for name in names:
+        found = getattr(cfg, name)
+        for value in found if isinstance(found, tuple) else (found,):
+            _within(name, value, *limits)
+
+
+def _rises(name: str, low: float, high: float) -> None:
+    if not low < high:
+        raise ValueError(f"{name} must rise from its least to its most, got {low:g} to {high:g}")
 
 
 @dataclass(frozen=True)
@@ -40,6 +76,12 @@ class InputCfg:
     frozen: float = 0.04
     remote: float = 3.0
 
+    def __post_init__(self) -> None:
+        _check(self, _TIME, "max_age", "stall", "frozen", "remote")
+        _check(self, _READING, "gyro", "acc", "joint_margin", "joint_speed", "torque")
+        _check(self, (0.0, 255.0), "temperature")
+        _check(self, (0, 100), "min_charge")
+
 
 @dataclass(frozen=True)
 class EnvelopeCfg:
@@ -71,6 +113,19 @@ class EnvelopeCfg:
     velocity_std: float = 1.0
     tilt_std: float = 10.0
     patience: float = 0.03
+
+    def __post_init__(self) -> None:
+        _check(self, (-360.0, 360.0), "pitch")
+        _check(self, (0.0, 180.0), "lean", "tilt_std")
+        _check(self, (-10.0, 10.0), "height")
+        _check(self, _MAYBE, "settle", "patience")
+        _check(self, _TURN, "joint_low", "joint_high")
+        _check(self, _READING, "joint_speed")
+        _check(self, (0.0, 10.0), "torque", "velocity_std")
+        _rises("pitch", *self.pitch)
+        _rises("height", *self.height)
+        for kind, low, high in zip(_KINDS, self.joint_low, self.joint_high, strict=True):
+            _rises(f"joint_low to joint_high of the {kind}", low, high)
 
     @cached_property
     def joints(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -108,6 +163,14 @@ class RampCfg:
     kd: float
     step: float = 0.1
 
+    def __post_init__(self) -> None:
+        for kind, angle, low, high in zip(_KINDS, self.pose, _LOWEST, _HIGHEST, strict=True):
+            _within(f"pose of the {kind}", angle, low, high)
+        _check(self, _TIME, "seconds")
+        _check(self, _KP, "kp")
+        _check(self, _KD, "kd")
+        _check(self, _STEP, "step")
+
     @cached_property
     def joints(self) -> NDArray[np.float64]:
         """`pose` of all joints, (12,)."""
@@ -126,6 +189,10 @@ class OutputCfg:
     step: float = 2.0
     damping: float = 5.0
 
+    def __post_init__(self) -> None:
+        _check(self, _STEP, "step")
+        _check(self, _KD, "damping")
+
 
 @dataclass(frozen=True)
 class PlanCfg:
@@ -142,6 +209,10 @@ class PlanCfg:
     jump: int = 60
     quantile: float = 0.8
     longest: int = 40
+
+    def __post_init__(self) -> None:
+        _check(self, (1, STEPS), "expires", "jump", "longest")
+        _check(self, (0.0, 1.0), "quantile")
 
 
 @dataclass(frozen=True)
@@ -162,6 +233,11 @@ class WatchdogCfg:
     stall: float = 0.2
     lost: float = 0.08
     after: float = 5.0
+
+    def __post_init__(self) -> None:
+        _check(self, (0.001, 0.1), "period")  # a tenth of a second is a long fall
+        _check(self, _TIME, "hang", "stall", "lost")
+        _check(self, _MAYBE, "after")
 
 
 @dataclass(frozen=True)

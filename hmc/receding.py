@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +16,7 @@ from hmc.memory import make_worlds
 from hmc.planner import Plan, Progress, batch_of, plan, worlds_for
 from hmc.running import Running
 from hmc.sim.base import Sim
+from hmc.solvers import ORDERS
 from hmc.start import Vector, make_start
 from hmc.task import Task
 from hmc.trace import Trace
@@ -41,6 +43,15 @@ class SearchCfg:
     draws: int = 16
     control_steps: int = 8000
     seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.order not in ORDERS:
+            raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {self.order!r}")
+        for name, least in {"samples": 1, "draws": 1, "control_steps": 1, "pairs": 0, "moves": 0}.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if not 0.0 <= self.seconds < math.inf:
+            raise ValueError(f"seconds must be a time, or 0 for any, got {self.seconds}")
 
     def options(self) -> dict[str, Any]:
         """Arguments of `Receding`."""

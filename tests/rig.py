@@ -236,7 +236,6 @@ class Rig:
             pitch=(cfg.pitch[0] - angle, cfg.pitch[1] + angle),
             lean=cfg.lean + angle,
             height=(cfg.height[0] - height, cfg.height[1] + height),
-            joint_speed=math.inf,
         )
         zero = np.zeros(12)
         body = Body(vertical(truth.qpos[3:7]), float(truth.qpos[2]), truth.qpos[7:], zero, zero)

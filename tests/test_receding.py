@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import re
+
 import pytest
 import torch
 
 from hmc import Budget, Evaluator, Receding, Schedule, make_start
+from hmc.receding import SearchCfg
 from tests.toy import Damp, Push, Ramp, ToySim, toy_task
 
 X = [1.5, 1.0]
@@ -128,3 +132,21 @@ def test_a_bad_state_stops_the_tick_and_leaves_the_loop_as_it_was():
     with pytest.raises(ValueError, match="got nan at index 1"):
         loop.tick([0.0, float("nan")])
     assert (loop.k, loop.schedule, loop.running.mode) == kept
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("order", "foo", "order must be one of uniform, tails, got 'foo'"),
+        ("samples", 0, "samples must be at least 1, got 0"),
+        ("draws", 0, "draws must be at least 1, got 0"),
+        ("control_steps", -1, "control_steps must be at least 1, got -1"),
+        ("pairs", -1, "pairs must be at least 0, got -1"),
+        ("moves", -2, "moves must be at least 0, got -2"),
+        ("seconds", -0.1, "seconds must be a time, or 0 for any, got -0.1"),
+        ("seconds", math.inf, "seconds must be a time, or 0 for any, got inf"),
+    ],
+)
+def test_a_search_that_cannot_be_is_refused(key, value, told):
+    with pytest.raises(ValueError, match=re.escape(told)):
+        SearchCfg(**{key: value})

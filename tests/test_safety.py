@@ -282,6 +282,15 @@ def test_the_robots_clock_overflows_and_restarts():
     assert "it restarted" in long.fault(1.0)
 
 
+def test_frames_that_never_came_are_counted():
+    """A robot's clock may round to steps of 1 and 3 ms."""
+    for ticks, gap in (((2, 3, 6, 7, 10), 0), ((2, 3, 5), 0), ((2, 6), 1), ((2, 4, 10), 2)):
+        checks = StateChecks(InputCfg())
+        for tick in ticks:
+            assert checks.take(good(tick), 1.0) is not None
+        assert checks.counts["gap"] == gap
+
+
 def test_a_remote_that_is_gone_is_a_fault_until_it_is_back():
     """By the robot's clock; a robot that has never had one near gets as long."""
     far = {"remote": ABSENT}

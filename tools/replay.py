@@ -7,7 +7,7 @@ settings of the estimator, from the readings that the run believed.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,11 +64,9 @@ class Replay:
         old = np.array([tick["x"] for tick in rows])
         new = np.array([self.again[tick["ms"]] for tick in rows])
         height = float(np.abs(old[:, 2] - new[:, 2]).max())
-        turns = [
-            np.arccos(np.clip(vertical(a) @ vertical(b), -1, 1))
-            for a, b in zip(old[:, 3:7], new[:, 3:7], strict=True)
-        ]
-        return height, float(np.max(turns))
+        p, q = old[:, 3:7], new[:, 3:7]  # q and -q are one attitude
+        apart = np.sort([np.linalg.norm(p - q, axis=1), np.linalg.norm(p + q, axis=1)], axis=0)
+        return height, float(4 * np.arctan2(apart[0], apart[1]).max())
 
 
 def replay(path: Path) -> Replay:
@@ -95,10 +93,9 @@ def replay(path: Path) -> Replay:
 
 
 def limits(path: Path) -> InputCfg:
-    """What a frame had to be like in the run that wrote a log; ages are the run's, not the replay's."""
+    """What a frame had to be like in the run that wrote a log."""
     lines = metadata(path).get("settings", "").splitlines()
-    cfg = override(DeployCfg(), [line for line in lines if line.startswith("input.")]).input
-    return replace(cfg, max_age=np.inf, stall=np.inf)
+    return override(DeployCfg(), [line for line in lines if line.startswith("input.")]).input
 
 
 def draw(it: Replay, path: Path) -> None:
