@@ -130,11 +130,33 @@ def test_push_order() -> None:
         ('{"states": {"drops": 1}}', "order 'states' does not take .*drops"),
         ('{"loss": "dance"}', "one of hold, damp, limp"),
         ('{"remote": {"buttons": ["Z"]}}', "order 'remote' does not take .*'Z'"),
+        ('{"remote": ["L2", "B"]}', "order 'remote' does not take "),
+        ('{"remote": {"lx": null}}', "order 'remote' does not take .*float"),
+        ('{"remote": {"lx": 1e40}}', "order 'remote' does not take .*too large"),
+        ('{"strength": 0.5}', "order 'strength' does not take 0.5"),
+        ('{"stuck": ["FL"]}', "order 'stuck' does not take "),
+        ('{"stuck": {"FL": 40000}}', "a foot's counts are -32768 to 32767, got 40000"),
+        ('{"stuck": {"FL": 1e400}}', "order 'stuck' does not take .*infinity"),
+        ('{"push": [50, 0, 0.1]}', "three finite forces"),
+        ('{"push": [NaN, 0, 0, 0.1]}', "three finite forces"),
+        ('{"push": [50, 0.1]}', "three finite forces"),
+        pytest.param("[" * 50_000, "nested too deeply", id="nested"),
+        pytest.param('{"loss": "' + 60_000 * "x" + '"}', "one of hold, damp, limp", id="long"),
     ],
 )
 def test_wrong_orders(order: str, told: str) -> None:
+    """An error for who gave it, and nothing else: the robot goes on as it would have."""
+    robot, other, desk = StandIn(ideal()), StandIn(ideal()), Desk(0)
     with pytest.raises(ValueError, match=told):
-        obey(StandIn(ideal()), order)
+        obey(robot, order)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.settimeout(2)
+        client.sendto(order.encode(), ("127.0.0.1", desk.port))
+        desk.serve(robot)
+        assert json.loads(client.recv(65536)).keys() == {"error"}
+    desk.close()
+    assert [robot.step([]) for _ in range(5)] == [other.step([]) for _ in range(5)]
+    assert np.array_equal(robot.truth().qpos, other.truth().qpos)
 
 
 def test_desk_answers() -> None:

@@ -26,10 +26,11 @@ from deploy.dds import Link, LinkError, Publisher, Subscriber
 from deploy.messages import LowCmd_, LowState_, WirelessController_
 from deploy.motion_switcher import MotionSwitcher
 from deploy.remote import Button, unpack
+from hmc.cli import command_line
 from hmc.go2 import model as go2
 from tools.go2_robot import main
 from tools.robot.motors import hold
-from tools.robot.orders import obey
+from tools.robot.orders import Desk, obey
 from tools.robot.process import LATEST, Args, Clock, Log, run
 from tools.robot.standin import Settings, StandIn, Truth, ideal
 
@@ -191,6 +192,47 @@ def test_errors_are_one_line(
     assert err.startswith("go2_robot: ")
     assert told in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--speed 0", "speed of the clock must be 0.001 to 1000, got 0.0"),
+        ("--port 99999", "port for orders must be 0 to 65535, got 99999"),
+        ("--seconds nan", "seconds of simulated time must be 0 or more, got nan"),
+        ("--robot.sensors.rate 0", "rate of the sensors must be more than 0, got 0.0"),
+        ("--robot.sensors.gyro inf", "gyro of the sensors must be 0 or more and finite, got inf"),
+        ("--robot.state-delay inf", "state_delay of frames must be 0 to 10 s, got inf"),
+        ("--robot.loss-after nan", "loss_after must be 0 s or more, got nan"),
+        ("--robot.body.mass inf", "mass of the body must be off by 0 to 0.9, got inf"),
+        ("--robot.body.friction 2 1", "friction of the body must be a least and a most of"),
+    ],
+)
+def test_settings_that_no_robot_has(words: str, told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        command_line(Args, words.split())
+    assert ended.value.code == 2
+    out, err = capsys.readouterr()
+    assert told in " ".join((out + err).replace("│", " ").split())
+
+
+def test_a_robot_that_diverges_leaves_its_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And gives its port back."""
+    step, log, told = StandIn.step, tmp_path / "truth.npz", list[str]()
+
+    def diverging(self: StandIn, frames: list[bytes]) -> list[bytes]:
+        if self.time > 0.021:
+            raise RuntimeError("the simulated robot diverged")
+        return step(self, frames)
+
+    monkeypatch.setattr("tools.robot.process.priority", lambda: "the test's own priority")
+    monkeypatch.setattr(StandIn, "step", diverging)
+    with pytest.raises(RuntimeError, match="diverged"):
+        run(Args(domain=DOMAIN, log=log), lambda: False, told.append)
+    with np.load(log) as truth:
+        assert truth["tick"].tolist() == list(range(2, 23, 2))
+    (port,) = re.findall(r"UDP port (\d+)", told[0])
+    Desk(int(port)).close()
 
 
 def test_a_long_log_leaves_the_garbage_collector_nothing_to_walk_over(tmp_path: Path) -> None:

@@ -33,6 +33,15 @@ class Body:
     friction: tuple[float, float] | None = (0.5, 1.0)
     sticks: bool = True
 
+    def __post_init__(self) -> None:
+        for name, most in (("mass", 0.9), ("length", 0.05), ("zero", math.pi)):
+            if not 0 <= (value := getattr(self, name)) <= most:
+                raise ValueError(f"{name} of the body must be off by 0 to {most:g}, got {value}")
+        if self.friction is not None and not 0 <= self.friction[0] <= self.friction[1] < math.inf:
+            raise ValueError(
+                f"friction of the body must be a least and a most of 0 or more, got {self.friction}"
+            )
+
 
 EXACT = Body(mass=0.0, length=0.0, zero=0.0, friction=None, sticks=False)
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, get_args
 
-from deploy.remote import Button, Remote
+from deploy.remote import Button, Remote, pack
 from hmc.go2.facts import LEGS
 from tools.robot.faults import Faults
+from tools.robot.sensors import COUNTS
 from tools.robot.standin import Loss, StandIn
 
 
@@ -30,9 +32,13 @@ def obey(robot: StandIn, order: str) -> dict[str, Any]:
     ==========  ==========================================  ===============================================
 
     Raises:
-        ValueError: not such an object; what stands before the fault in it was carried out.
+        ValueError: not such an object; what stands before the fault in it was carried out, and nothing of
+            the fault's own.
     """
-    found = json.loads(order)
+    try:
+        found = json.loads(order)
+    except RecursionError:
+        raise ValueError("an order is a JSON object, got one that is nested too deeply") from None
     if not isinstance(found, dict):
         raise ValueError(f'an order is a JSON object such as {{"push": [50, 0, 0, 0.1]}}, got {order}')
     for name, value in found.items():
@@ -40,7 +46,7 @@ def obey(robot: StandIn, order: str) -> dict[str, Any]:
             raise ValueError(f"no order {name!r}: there are {', '.join(ORDERS)}")
         try:
             ORDERS[name](robot, value)
-        except (TypeError, KeyError) as error:
+        except (TypeError, KeyError, AttributeError, OverflowError, struct.error) as error:
             raise ValueError(f"order {name!r} does not take {value!r}: {error}") from None
     truth = robot.truth()
     return {
@@ -65,14 +71,20 @@ def _strength(robot: StandIn, value: dict[str, float]) -> None:
 def _stuck(robot: StandIn, value: dict[str, int]) -> None:
     if unknown := set(value) - set(LEGS):
         raise ValueError(f"no foot {', '.join(sorted(unknown))}: there are {', '.join(LEGS)}")
-    robot.feet.stuck = {LEGS.index(foot): int(counts) for foot, counts in value.items()}
+    stuck = {LEGS.index(foot): int(counts) for foot, counts in value.items()}
+    low, high = COUNTS
+    if beyond := [counts for counts in stuck.values() if not low <= counts <= high]:
+        raise ValueError(f"a foot's counts are {low} to {high}, got {beyond[0]}")
+    robot.feet.stuck = stuck
 
 
 def _remote(robot: StandIn, value: dict[str, Any]) -> None:
     buttons = Button(0)
     for name in value.get("buttons", ()):
         buttons |= Button[name]
-    robot.remote = Remote(**{**value, "buttons": buttons})
+    remote = Remote(**{**value, "buttons": buttons})
+    pack(remote)  # or the next state could not be told
+    robot.remote = remote
 
 
 def _states(robot: StandIn, value: dict[str, float]) -> None:
@@ -100,11 +112,17 @@ ORDERS: dict[str, Callable[[StandIn, Any], None]] = {
 }
 
 
+_LONGEST = 2000  # characters of an error: it tells the order again, and has to fit into a datagram
+
+
 class Desk:
     """Where orders come in: a UDP port of this machine alone; each datagram is an order, and is answered.
 
     Args:
         port: 0 for any free one.
+
+    Raises:
+        OSError: the port is taken.
     """
 
     def __init__(self, port: int):
@@ -127,7 +145,7 @@ class Desk:
             try:
                 answer = obey(robot, octets.decode())
             except ValueError as error:
-                answer = {"error": str(error)}
+                answer = {"error": str(error)[:_LONGEST]}
             self._socket.sendto(json.dumps(answer).encode(), sender)
 
     def close(self) -> None:

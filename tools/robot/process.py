@@ -53,6 +53,14 @@ class Args:
     lockstep: bool = False
     parent: int = 0
 
+    def __post_init__(self) -> None:
+        if not 0.001 <= self.speed <= 1000:
+            raise ValueError(f"speed of the clock must be 0.001 to 1000, got {self.speed}")
+        if not 0 <= self.port < 2**16:
+            raise ValueError(f"port for orders must be 0 to {2**16 - 1}, got {self.port}")
+        if not self.seconds >= 0:
+            raise ValueError(f"seconds of simulated time must be 0 or more, got {self.seconds}")
+
 
 TRUTH = np.dtype(
     [
@@ -114,6 +122,7 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
     Raises:
         LinkError: the network interface cannot be used, or a robot is there already.
         ValueError: an order is none.
+        RuntimeError: the simulated robot diverged; the log is written first.
     """
     link = Link(args.domain, args.interface)
     robot = StandIn(args.robot)
@@ -124,31 +133,33 @@ def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> 
     remote = link.publisher("rt/wirelesscontroller", WirelessController_)
     switcher = MotionSwitcherService(link, "" if robot.released else CONTROLLER)
     desk, log = Desk(args.port), Log(args.log)
-    outgoing, truth = robot.step([]), robot.truth()
-    where = f"domain {args.domain} on {args.interface}, orders at UDP port {desk.port}"
-    say(f"ready: {where}, {priority()}")
-    clock = Clock(PERIOD / args.speed)
-    while robot.time < args.seconds and not stopped():
-        if not args.lockstep:
-            clock.wait()
-        left = time.monotonic()
-        for frame in outgoing:  # measured now, and worked out before: a robot's clock waits for nothing
-            states.write(frame)
-        switcher.serve()
-        robot.release(switcher.name == "")
-        desk.serve(robot)
-        if args.lockstep:
-            frames = commands.take(0.1)
-            if not frames:  # nobody there yet, or a frame was lost: say it again
-                continue
-        else:
-            frames = commands.take()
-        log.add(truth, left)
-        outgoing, truth = robot.step(frames), robot.truth()
-        if truth.tick % 20 == 0:
-            remote.write(_pressed(robot).serialize(use_version_2=False))
-    desk.close()
-    log.write()
+    try:
+        outgoing, truth = robot.step([]), robot.truth()
+        where = f"domain {args.domain} on {args.interface}, orders at UDP port {desk.port}"
+        say(f"ready: {where}, {priority()}")
+        clock = Clock(PERIOD / args.speed)
+        while robot.time < args.seconds and not stopped():
+            if not args.lockstep:
+                clock.wait()
+            left = time.monotonic()
+            for frame in outgoing:  # measured now, and worked out before: a robot's clock waits for nothing
+                states.write(frame)
+            switcher.serve()
+            robot.release(switcher.name == "")
+            desk.serve(robot)
+            if args.lockstep:
+                frames = commands.take(0.1)
+                if not frames:  # nobody there yet, or a frame was lost: say it again
+                    continue
+            else:
+                frames = commands.take()
+            log.add(truth, left)
+            outgoing, truth = robot.step(frames), robot.truth()
+            if truth.tick % 20 == 0:
+                remote.write(_pressed(robot).serialize(use_version_2=False))
+    finally:  # what led to a robot's divergence is what the truth is wanted for
+        desk.close()
+        log.write()
     say(f"ended after {robot.time:.3f} s; {clock.report()}; refused commands: {dict(robot.refused)}")
 
 

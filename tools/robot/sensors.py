@@ -10,10 +10,12 @@ import numpy as np
 
 from deploy.codec import Floats, Ints
 
+COUNTS = -(2**15), 2**15 - 1  # that a foot can tell
+
 
 @dataclass(frozen=True)
 class Sensors:
-    """Errors of the sensors. Zero turns each off.
+    """Errors of the sensors. Zero turns each off; the rate is none.
 
     The orders of magnitude are assumptions: no Allan deviations of this robot's IMU are published, and its
     feet's counts are known to be raw, different from foot to foot, and to drift.
@@ -51,6 +53,13 @@ class Sensors:
     foot_offset: float = 15.0
     foot_drift: float = 0.3
     foot_noise: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} of the sensors must be 0 or more and finite, got {value}")
+        if self.rate == 0:
+            raise ValueError(f"rate of the sensors must be more than 0, got {self.rate}")
 
 
 CLEAN = Sensors(**{name: 0.0 for name in Sensors.__dataclass_fields__ if name != "rate"})
@@ -122,7 +131,7 @@ class Feet:
     """Counts of the force sensors in the feet: scale times force, an offset that drifts, noise.
 
     Attributes:
-        stuck: counts that a foot tells whatever happens, by its index.
+        stuck: COUNTS that a foot tells whatever happens, by its index.
     """
 
     def __init__(self, cfg: Sensors, rng: np.random.Generator):
@@ -136,7 +145,7 @@ class Feet:
         walk, noise = self._rng.normal(size=(2, 4))
         self._offset = self._offset + self._cfg.foot_drift * math.sqrt(dt) * walk
         counts = self._scale * force + self._offset + self._cfg.foot_noise * noise
-        counts = np.minimum(np.maximum(np.rint(counts), -(2**15)), 2**15 - 1).astype(np.int64)
+        counts = np.minimum(np.maximum(np.rint(counts), COUNTS[0]), COUNTS[1]).astype(np.int64)
         for foot, value in self.stuck.items():
             counts[foot] = value
         return counts

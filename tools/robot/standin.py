@@ -74,6 +74,13 @@ class Settings:
     states: Faults = field(default_factory=Faults)
     commands: Faults = field(default_factory=Faults)
 
+    def __post_init__(self) -> None:
+        for name in ("state_delay", "command_delay"):
+            if not 0 <= (value := getattr(self, name)) <= 10:
+                raise ValueError(f"{name} of frames must be 0 to 10 s, got {value}")
+        if not self.loss_after >= 0:
+            raise ValueError(f"loss_after must be 0 s or more, got {self.loss_after}")
+
 
 def ideal(seed: int = 0, start: Start = "standing") -> Settings:
     """A robot without any unkindness: the planner's body, exact sensors, no delay."""
@@ -146,10 +153,11 @@ class StandIn:
             self.released, self._command, self._heard = released, damp(DAMPING), math.inf
 
     def push(self, force: Sequence[float], duration: float) -> None:
-        """Push the trunk with a force [N] in the world frame, (3,), for so long [s]."""
-        self._push, self._push_until = np.array(force, dtype=np.float64), self.time + duration
-        if self._push.shape != (3,) or not np.isfinite([*self._push, duration]).all():
+        """Push the trunk with a force [N] in the world frame, (3,), for so long [s]; else a ValueError."""
+        push = np.array(force, dtype=np.float64)
+        if push.shape != (3,) or not np.isfinite([*push, duration]).all():
             raise ValueError(f"a push is three finite forces and a duration, got {force} for {duration}")
+        self._push, self._push_until = push, self.time + duration
 
     def step(self, frames: list[bytes]) -> list[bytes]:
         """Advance by PERIOD under the newest command.
