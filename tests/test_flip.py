@@ -19,7 +19,7 @@ from hmc.cfg import load
 from hmc.go2.stages import Stages
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import flip_task
-from tools import closed_loop, flip
+from tools import closed_loop, flip, record_flips
 from tools.random_policy import write_random_policy
 
 SHORT = (
@@ -174,6 +174,20 @@ def test_what_is_done_is_summarised_when_a_worker_is_lost(overrides, done, tmp_p
     flip.main(flip.Args(seeds=2, out=tmp_path, video=False, set=overrides))
     assert "a worker was lost (out of memory?) with 1 of 2 runs done" in capsys.readouterr().out
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["seeds"] == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"first": 32}, "expected 0 <= first <= last, got 32 and 30"),
+        ({"states": 0}, "states must be at least 1, got 0"),
+    ],
+)
+def test_records_of_no_jump(tmp_path, capsys, given, line):
+    with pytest.raises(SystemExit) as ended:
+        record_flips.main(record_flips.Args(tmp_path / "flips.pt", **given))
+    assert ended.value.code == 2
+    assert line in capsys.readouterr().err
 
 
 def test_no_seeds(capsys):
