@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+
+from rich.console import Console
+
+from tools import study
 
 
 @dataclass(frozen=True)
@@ -48,3 +54,31 @@ def work_on_a_node(folder: Path, head: str, job: Job) -> Row:
     while not away and len(list(folder.glob("away_*"))) < 2 and time.monotonic() < give_up:
         time.sleep(0.1)
     return Row(job, job.number**2)
+
+
+def work_slowly(folder: Path, job: Job) -> Row:
+    """The square, after a minute unless it is stopped, which takes a while to be written down."""
+    try:
+        (folder / f"begun_{job.number}").touch()
+        time.sleep(60)
+    except KeyboardInterrupt:
+        time.sleep(0.5)
+        (folder / f"saved_{job.number}").touch()
+        raise
+    return Row(job, job.number**2)
+
+
+def main(folder: Path) -> int:
+    """Such a study as a program, of three jobs on two processes."""
+    return study.stoppable(_program)(folder)
+
+
+def _program(folder: Path) -> int:
+    jobs, workers = [Job(i) for i in range(3)], study.Workers(processes=2)
+    table, console = folder / "table.csv", Console(width=200)
+    found = study.carry_out(partial(work_slowly, folder), jobs, table, Row, workers, console)
+    return 1 if found is None else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -11,7 +11,8 @@ import torch
 from hmc.cfg import load
 from hmc.sampling import METHODS
 from hmc.sim.cartpole import CartpoleSim
-from tools import cartpole, cartpole_study, study
+from hmc.tasks.cartpole import CartpoleCfg
+from tools import cartpole, cartpole_figures, cartpole_study, study
 from tools.cartpole_figures import gap, reference
 
 TINY = (
@@ -67,7 +68,8 @@ def test_modes_and_angles_are_compared_in_both_parts(cfg, rows):
 
 def test_a_longer_horizon_is_no_worse_than_what_holds_the_shorter_one():
     """What iLQR comes to at 40 steps, held up from there on, costs hardly more than it does."""
-    cfg = cartpole_study.StudyCfg(horizons=(40, 60), compare=(), iterations=30)
+    task = CartpoleCfg(horizon=60)
+    cfg = cartpole_study.StudyCfg(horizons=(40, 60), compare=(), iterations=30, task=task)
     short, long = (cartpole_study.Job("solve", "ilqr", horizon, 0, 5, math.pi) for horizon in (40, 60))
     before, after = cartpole_study.optimum(cfg, short), cartpole_study.optimum(cfg, long)
     assert before.cost < 15
@@ -124,6 +126,29 @@ def test_other_settings_begin_anew(rows, tmp_path, monkeypatch):
     for settings in (TINY, TINY, (*TINY, "rollouts=70")):
         cartpole.main(cartpole.Args(out=tmp_path, set=settings))
     assert todos == [len(rows), len(rows) - 1, len(rows)]
+
+
+def test_what_cannot_be_drawn_is_refused_before_it_is_computed(capsys, tmp_path):
+    for items, line in (
+        (("task.horizon=50",), "task.horizon = 50, which is drawn: choose one of the horizons 6, 8"),
+        (("seeds=0",), "seeds must be at least 1, got 0"),
+        (("optima=0",), "optima must be at least 1, got 0"),
+    ):
+        with pytest.raises(SystemExit):
+            cartpole.main(cartpole.Args(out=tmp_path, set=(*TINY, *items)))
+        assert line in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_table_is_there_if_a_figure_fails(rows, tmp_path, monkeypatch):
+    def fails(*_):
+        raise RuntimeError
+
+    monkeypatch.setattr(study, "run_all", lambda *_: iter(rows))
+    monkeypatch.setattr(cartpole_figures, "gaps", fails)
+    with pytest.raises(RuntimeError):
+        cartpole.main(cartpole.Args(out=tmp_path, set=TINY))
+    assert study.read(tmp_path / "results.csv", cartpole_study.Row) == rows
 
 
 def test_an_unknown_key(capsys):

@@ -25,6 +25,29 @@ def test_when_a_level_is_first_reached():
     assert reached(run, STANCE, 0.96) is None
 
 
+def test_steps_are_those_that_were_logged():
+    """By other worlds after iteration 1, and by two processes; older logs do not say."""
+    at = np.arange(4)
+    counted = {curves.STEPS: (at[1:], np.array([3e6, 9e6, 15e6]))}
+    assert Curves("walk", 500_000, counted).millions(at).tolist() == [0.5, 3.0, 9.0, 15.0]
+    assert Curves("walk", 500_000, {}).millions(at).tolist() == [0.5, 1.0, 1.5, 2.0]
+
+
+def test_a_run_logs_its_steps(tmp_path):
+    folder = tmp_path / "run"
+    runner = make_runner(folder)
+    runner.last_iteration = 2
+    runner.logger.tot_timesteps = 1000  # of an earlier start with other worlds
+    ppo.train(runner, folder)
+    assert curves.read(folder).lines[curves.STEPS][1].tolist() == [1048, 1096]
+
+
+def test_no_runs(capsys):
+    with pytest.raises(SystemExit):
+        curves.main(curves.Args(()))
+    assert "no runs are given" in capsys.readouterr().err
+
+
 def test_the_program(tmp_path, capsys):
     runner = make_runner(tmp_path / "run")
     runner.last_iteration = 2

@@ -51,9 +51,24 @@ def test_a_motion_that_is_not_there(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("error: 'swim': expected one of ")
 
 
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"seconds": 0.5}, "seconds must be more than 1, of which no figure counts, got 0.5"),
+        ({"filters": ()}, "--motions and --filters take one or more each"),
+    ],
+)
+def test_nothing_to_measure(tmp_path, capsys, given, line):
+    with pytest.raises(SystemExit):
+        estimator_study.main(Args(**given, out=tmp_path))
+    assert line in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("module", STUDIES, ids=lambda module: module.__name__)
 def test_every_study_takes_ray_and_goes_on(module):
-    args = module.Args("handstand") if module is seeds else module.Args()
+    args = module.Args()
     assert isinstance(args, study.Workers)
     assert args.resume
     assert args.ray is None

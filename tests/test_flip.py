@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -18,7 +19,7 @@ from hmc.cfg import load
 from hmc.go2.stages import Stages
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import flip_task
-from tools import closed_loop, flip
+from tools import closed_loop, flip, record_flips
 from tools.random_policy import write_random_policy
 
 SHORT = (
@@ -162,6 +163,39 @@ def test_the_program(overrides, done, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(flip, "run_all", lambda *_: iter([replace(done, stages=reached)]))
     monkeypatch.setattr(flip, "write_run", lambda *_: None)
     assert flip.main(replace(args, seeds=1)) == 0
+
+
+def test_what_is_done_is_summarised_when_a_worker_is_lost(overrides, done, tmp_path, monkeypatch, capsys):
+    def lost(*_):
+        yield done
+        raise BrokenProcessPool
+
+    monkeypatch.setattr(flip, "run_all", lost)
+    flip.main(flip.Args(seeds=2, out=tmp_path, video=False, set=overrides))
+    assert "a worker was lost (out of memory?) with 1 of 2 runs done" in capsys.readouterr().out
+    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["seeds"] == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"first": 32}, "expected 0 <= first <= last, got 32 and 30"),
+        ({"states": 0}, "states must be at least 1, got 0"),
+    ],
+)
+def test_records_of_no_jump(tmp_path, capsys, given, line):
+    with pytest.raises(SystemExit) as ended:
+        record_flips.main(record_flips.Args(tmp_path / "flips.pt", **given))
+    assert ended.value.code == 2
+    assert line in capsys.readouterr().err
+
+
+def test_no_seeds(capsys):
+    with pytest.raises(SystemExit):
+        flip.main(flip.Args(seeds=0))
+    assert "seeds must be at least 1, got 0" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="processes must be at least 1, or 0"):
+        flip.Args(processes=-1)
 
 
 def refused(capsys, *items: str) -> str:

@@ -11,6 +11,7 @@ import pytest
 from hmc.cfg import load
 from tests.test_flip import SHORT
 from tools import growth, study
+from tools.closed_loop import RunCfg, study_cfg
 from tools.growth import FactorCfg, GrowthCfg, Job, Row, jobs, points, settings, work
 from tools.random_policy import write_random_policy
 
@@ -26,11 +27,11 @@ def cfg(tmp_path_factory) -> GrowthCfg:
     path = write_random_policy(tmp_path_factory.mktemp("policies") / "random.onnx", hidden=(8,))
     base = (*SHORT, "task.jump.mpc=false", f"task.foot={path}", f"task.hand={path}")
     made = GrowthCfg(trials=2, first_seed=7, base=base, factors=FACTORS)
-    return replace(made, flip=settings(made, Job("horizon", 6, 7)))
+    return replace(made, flip=load(growth.ROOT / "cfg" / "flip.toml", RunCfg, base))
 
 
 def test_the_committed_study_can_be_read():
-    cfg = load(growth.ROOT / "cfg" / "growth.toml", GrowthCfg)
+    cfg = study_cfg(growth.ROOT / "cfg" / "growth.toml", GrowthCfg, ())
     for factor in cfg.factors:
         for value in factor.values:
             settings(cfg, Job(factor.name, value, 0))
@@ -48,6 +49,16 @@ def test_a_factor_changes_one_thing(cfg):
     assert three.task.cost.tail == five.task.cost.tail != 0.0
     timed = settings(cfg, Job("time", 0.002, 0)).search
     assert (timed.seconds, timed.draws) == (0.002, 100)
+
+
+def test_what_is_set_of_the_flip_holds_in_every_run():
+    """It changed the cost that runs are judged by, and not the runs; a factor still has the last word."""
+    items = ("flip.start.joints=0.01", "flip.task.cost.height=2.0", "flip.task.horizon=9")
+    found = study_cfg(growth.ROOT / "cfg" / "growth.toml", GrowthCfg, items)
+    modes, horizon = (settings(found, Job(name, 25, 0)) for name in ("draws", "horizon"))
+    for each in (modes, horizon):
+        assert (each.start.joints, each.task.cost.height) == (0.01, 2.0)
+    assert (modes.task.horizon, horizon.task.horizon) == (9, 25)
 
 
 def test_a_run_has_more_to_choose_from_with_more_modes(cfg):

@@ -12,9 +12,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from hmc import Budget, Evaluator, Rules, Schedule, Switch, make_start, plan
+from hmc.cfg import load
+from hmc.go2.task import flip_task
 from hmc.tasks.cartpole import CartpoleCfg, cartpole
 from tests.toy import Bad, Damp, Push, slow_cost, toy_task
 from tools import landscape as shows
+from tools.closed_loop import RunCfg, planned, run
 from tools.figures import search
 from tools.landscape import Args, Landscape, draw, landscape, main, of_log, parse, read, reason
 
@@ -170,13 +173,25 @@ def test_steps_that_cannot_be_shown(tmp_path):
     log = tmp_path / "seed_0.json"
     steps = [{"mode": mode, "u": [0.0]} for mode in ("foot", "jump", "hand", "hand")]
     log.write_text(json.dumps({"seed": 7, "steps": steps}))
-    assert read(log, 3)["before"]["mode"] == "hand"
-    assert read(log, 3)["seed"] == 7, "of the jump's noise"
+    assert read(log, 2) == (7, steps[:3])
     with pytest.raises(ValueError, match="has steps 0 to 3, got --step 4"):
         read(log, 4)
-    for step in (1, 2):
-        with pytest.raises(ValueError, match=f"step {step} is in the jump"):
-            read(log, step)
+
+
+def test_a_plan_costs_what_its_log_says(tmp_path):
+    """From the input and with the memory that there were: at the start, and in each mode."""
+    items = ("seconds=0.64", "task.horizon=16", "task.command=8", "task.jump.dwell=8", "task.jump.mpc=false")
+    cfg = load(shows.ROOT / "cfg" / "flip.toml", RunCfg, items)
+    task = flip_task(cfg.task, seed=3, threads=1)
+    done = run(planned(cfg, task, 3), task.cost, cfg, 3)
+    (tmp_path / "seed_3.json").write_text(json.dumps({"seed": 3, "steps": done.log}))
+    assert len(set(done.modes)) > 1
+    changed = next(k for k in range(1, 32) if done.modes[k] != done.modes[k - 1])
+    for step in (0, 1, 15, changed, changed + 1, changed + 5, 30):
+        planned_in, start, schedule = of_log(Args(tmp_path / "seed_3.json", step=step, set=items))
+        cost = Evaluator(planned_in, planned_in.make_sim(4), start).follow(schedule)
+        assert cost == pytest.approx(done.log[step]["cost"], abs=1e-4), step
+        assert (start.mode is None) == (step == 0)
 
 
 def test_the_noise_is_that_of_the_run(tmp_path, monkeypatch):

@@ -35,6 +35,12 @@ def test_every_order_runs_on_every_system():
     assert {job.order for job in found} == set(ORDERS)
 
 
+def test_settings_of_both_systems():
+    """Those of the cartpole were dropped."""
+    cfg = orders.settings(("seeds=2", "cartpole.rollouts=10", "flip.search.moves=3"))
+    assert (cfg.seeds, cfg.cartpole.rollouts, cfg.flip.search.moves) == (2, 10, 3)
+
+
 def test_all_spend_the_same(cfg):
     for part, limit in (("solve", 60 * 8), ("loop", 2 * 10 * 8), ("flip", 40)):
         horizon = cfg.flip.task.horizon if part == "flip" else 8
@@ -57,12 +63,12 @@ def test_the_program(cfg, tmp_path, monkeypatch, capsys):
         yield from (row for row in found if row.job in todo)
 
     monkeypatch.setattr(study, "run_all", some)
-    monkeypatch.setattr(orders, "study_cfg", lambda *_: cfg)
+    monkeypatch.setattr(orders, "settings", lambda *_: cfg)
     assert orders.main(orders.Args(out=tmp_path)) == 0
     assert orders.main(orders.Args(out=tmp_path)) == 0
     assert len(made) == len(found), "nothing is run twice"
     assert study.read(tmp_path / "orders.csv", Row) == found
-    monkeypatch.setattr(orders, "study_cfg", lambda *_: replace(cfg, seeds=3))
+    monkeypatch.setattr(orders, "settings", lambda *_: replace(cfg, seeds=3))
     more = [Row(Job("flip", 6, order, 2), 4.0, 7.0, True) for order in ORDERS]
     monkeypatch.setattr(
         study, "run_all", lambda do, todo, *_: iter([replace(more[0], job=job) for job in todo])

@@ -12,6 +12,7 @@ from hmc.go2.model import load_model
 from hmc.sim.mujoco import MujocoSim
 from tests.test_flip import SHORT
 from tools import planning_model, study
+from tools.closed_loop import RunCfg, study_cfg
 from tools.planning_model import Job, ModelCfg, Row, StudyCfg, jobs, rolled_out, settings, speeds, table, work
 from tools.random_policy import write_random_policy
 
@@ -27,15 +28,21 @@ def cfg(tmp_path_factory) -> StudyCfg:
     path = write_random_policy(tmp_path_factory.mktemp("policies") / "random.onnx", hidden=(8,))
     base = (*SHORT, "task.jump.mpc=false", f"task.foot={path}", f"task.hand={path}")
     made = StudyCfg(trials=2, first_seed=7, worlds=8, repeats=1, base=base, models=MODELS)
-    return replace(made, flip=settings(made, "own"))
+    return replace(made, flip=load(planning_model.ROOT / "cfg" / "flip.toml", RunCfg, base))
 
 
 def test_the_committed_study_can_be_read():
-    cfg = load(planning_model.ROOT / "cfg" / "planning_model.toml", StudyCfg)
+    cfg = study_cfg(planning_model.ROOT / "cfg" / "planning_model.toml", StudyCfg, ())
     own, *others = (settings(cfg, model.name).task for model in cfg.models)
     assert (own.substeps, own.iterations, own.contacts) == (4, None, "all"), "ratios are to the robot's own"
     assert len({own, *others}) == len(cfg.models)
     assert len(jobs(cfg)) == len(set(jobs(cfg))) == cfg.trials * len(cfg.models)
+
+
+def test_what_is_set_of_the_flip_holds_on_every_model():
+    items = ("flip.start.joints=0.01",)
+    cfg = study_cfg(planning_model.ROOT / "cfg" / "planning_model.toml", StudyCfg, items)
+    assert {settings(cfg, model.name).start.joints for model in cfg.models} == {0.01}
 
 
 def test_the_robot_stays_as_it_is(cfg, monkeypatch):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from hmc.go2.network import Network
 from hmc.go2.observe import anchor_of
@@ -32,6 +33,7 @@ from tools.table2_study import (
     executed_costs,
     jobs,
     orders,
+    sequences,
     told,
     tune,
     work,
@@ -153,8 +155,22 @@ def test_the_program(cfg, settings, tmp_path, monkeypatch, capsys):
     assert len((tmp_path / "table2.md").read_text(encoding="utf-8").splitlines()) == 2 + len(CONTROLLERS)
     assert CONTROLLERS["pitch"] in capsys.readouterr().out
     (folder,) = (path for path in tmp_path.iterdir() if path.is_dir())
-    rules = table2.tuned(cfg, folder / "rules.json", None)
+    rules = table2.tuned(cfg, folder / "rules.json", Console())
     assert rules["untuned"] == Rule(0, 2)
+    kept, grids = dict(rules), list[int]()
+    (folder / "rules.json").write_text(json.dumps({"pitch": asdict(rules["pitch"])}))
+
+    def stops(_, grid, modes):
+        grids.append(len(grid))
+        if modes is not None:
+            raise KeyboardInterrupt
+        return kept["sequence"], 1.0
+
+    monkeypatch.setattr(table2, "tune", stops)
+    assert table2.main(table2.Args(out=tmp_path, set=settings)) == 1
+    assert "stopped: the same command goes on from there" in capsys.readouterr().err
+    assert grids == [len(sequences(cfg)), len(orders(cfg))], "that of the pitch was known"
+    assert set(json.loads((folder / "rules.json").read_text())) == {"untuned", "sequence", "pitch"}
     again, _ = work(cfg, rules, Job("sequence", 100))
     before = next(row for row in rows if row.job == again.job)
     assert (again.cost, again.control_steps) == (before.cost, before.control_steps)

@@ -35,20 +35,22 @@ class Args(study.Workers):
     set: tuple[str, ...] = ()
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Run what is missing, write the table and the figures."""
     console = Console()
     with one_line_errors():
         cfg = load(ROOT / "cfg" / "cartpole.toml", StudyCfg, args.set)
-        table = study.folder_of(args.out, cfg, args.resume) / "results.csv"
+        study.at_least_one(cfg, "seeds", "optima")
+        table = study.folder_of(args.out, cfg, Row, args.resume) / "results.csv"
     rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args, console)
     if rows is None:
         return 1
+    study.write(args.out / "results.csv", rows)
     cartpole_figures.gaps(args.out / "gap.png", rows, cfg)
     job = Job("solve", "schedules", cfg.task.horizon, 0, cfg.task.num_modes, cfg.task.angle)
     best = cartpole_figures.reference(rows, job)
     cartpole_figures.sequence(args.out / "sequence.png", search(cfg, job), optimum(cfg, best.job), cfg)
-    study.write(args.out / "results.csv", rows)
     console.print(cartpole_figures.table(rows, cfg))
     return 0
 

@@ -98,9 +98,13 @@ class StudyCfg:
     ps: SamplerCfg = field(default_factory=SamplerCfg)
 
     def __post_init__(self) -> None:
+        known = ", ".join(map(str, self.horizons))
         if not set(self.compare) <= set(self.horizons):
-            known = ", ".join(map(str, self.horizons))
             raise ValueError(f"compare = {list(self.compare)}: choose among the horizons {known}")
+        if self.task.horizon not in self.horizons:
+            raise ValueError(
+                f"task.horizon = {self.task.horizon}, which is drawn: choose one of the horizons {known}"
+            )
 
 
 @dataclass(frozen=True)

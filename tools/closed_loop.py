@@ -21,7 +21,7 @@ from hmc.go2.model import SUBSTEPS, product
 from hmc.go2.observe import pitch
 from hmc.go2.stages import Stages, judge
 from hmc.go2.stances import FOOTSTAND
-from hmc.go2.task import FlipCfg
+from hmc.go2.task import FlipCfg, policy_path
 from hmc.receding import SearchCfg
 from hmc.running import Running
 
@@ -163,6 +163,17 @@ def chosen(modes: ModeSet, choose: Callable[[Tensor, int], str]) -> Controller:
     return act
 
 
+def policies(*tasks: FlipCfg) -> list[Path]:
+    """The policy files that flips of these tasks are run by."""
+    found: dict[Path, None] = {}
+    for cfg in tasks:
+        critics = ("footstand_value", "handstand_value") if cfg.cost.value > 0 else ()
+        learned = [name for name in cfg.idle if name in ("stand", "getup")]
+        given = {"footstand": cfg.foot, "handstand": cfg.hand, **dict.fromkeys((*critics, *learned), "")}
+        found |= dict.fromkeys(policy_path(name, path) for name, path in given.items())
+    return list(found)
+
+
 def same_model(cfg: FlipCfg) -> bool:
     """Whether a snapshot of the nominal robot means the same in the planner's model: it says how a world
     moves, not what the floor holds up, nor how often the solver iterates."""
@@ -177,11 +188,16 @@ def study_cfg(path: Path, kind: type[S], items: tuple[str, ...]) -> S:
 
     Overrides that begin with ``flip.`` are the latter's, and so is the study's `base`, if it has one.
     """
-    own = tuple(item for item in items if not item.startswith("flip."))
-    flip = tuple(item.removeprefix("flip.") for item in items if item.startswith("flip."))
+    own, flip = split(items, "flip.")
     found: Any = load(path, kind, own)
     base = getattr(found, "base", ())
     return cast(S, replace(found, flip=load(path.with_name("flip.toml"), RunCfg, (*base, *flip))))
+
+
+def split(items: tuple[str, ...], prefix: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Overrides without a prefix, and those with it, which they lose."""
+    inner = tuple(item.removeprefix(prefix) for item in items if item.startswith(prefix))
+    return tuple(item for item in items if not item.startswith(prefix)), inner
 
 
 @torch.no_grad()

@@ -34,6 +34,7 @@ CURVES = {
 }
 
 
+STEPS = "Perf/environment_steps"  # up to the end of each iteration, of all processes
 TIMES = ("Perf/collection_time", "Perf/learning_time")  # of each iteration [s]
 
 
@@ -58,13 +59,21 @@ class Curves:
 
     Attributes:
         title: what was trained.
-        batch: environment steps an iteration.
+        batch: environment steps an iteration, where the log does not count them.
         lines: tensorboard tag -> (iterations, values), (n,) each.
     """
 
     title: str
     batch: int
     lines: dict[str, tuple[np.ndarray, np.ndarray]]
+
+    def millions(self, at: np.ndarray) -> np.ndarray:
+        """Environment steps [million] up to the end of iterations `at`, (n,)."""
+        known, steps = self.lines.get(STEPS, (np.zeros(0), np.zeros(0)))
+        found = (at + 1) * float(self.batch)
+        if len(known):
+            found = np.where(at < known[0], found, np.interp(at, known, steps))
+        return np.asarray(found / 1e6)
 
 
 def read(folder: Path) -> Curves:
@@ -73,7 +82,7 @@ def read(folder: Path) -> Curves:
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
     lines = {}
-    for tag in (*CURVES, "/success/frontier", *TIMES):
+    for tag in (*CURVES, "/success/frontier", *TIMES, STEPS):
         if tag in events.Tags()["scalars"]:
             last = {event.step: event.value for event in events.Scalars(tag)}
             lines[tag] = np.array(sorted(last)), np.array([last[step] for step in sorted(last)])
@@ -87,7 +96,7 @@ def reached(run: Curves, tag: str, level: float) -> tuple[float, float] | None:
     if len(there) == 0:
         return None
     spent = (seconds[at <= there[0]].sum() for at, seconds in (run.lines[tag] for tag in TIMES))
-    return float((there[0] + 1) * run.batch / 1e6), float(sum(spent) / 60)
+    return float(run.millions(there[:1])[0]), float(sum(spent) / 60)
 
 
 def draw(runs: Sequence[Curves], out: Path) -> None:
@@ -99,12 +108,10 @@ def draw(runs: Sequence[Curves], out: Path) -> None:
         for number, (tag, words) in enumerate(CURVES.items()):
             if tag in run.lines:
                 steps, values = run.lines[tag]
-                axis.plot(steps * run.batch / 1e6, values, color=f"C{number}", label=words)
+                axis.plot(run.millions(steps), values, color=f"C{number}", label=words)
         if "/success/frontier" in run.lines:  # the curriculum's places: 1 the stance, -1 the other one
             steps, values = run.lines["/success/frontier"]
-            axis.plot(
-                steps * run.batch / 1e6, values, color="grey", linestyle=":", label="furthest open place"
-            )
+            axis.plot(run.millions(steps), values, color="grey", linestyle=":", label="furthest open place")
         axis.set_title(run.title)
         axis.set_xlabel("environment steps [million]")
         axis.grid(alpha=0.3)
@@ -118,6 +125,8 @@ def draw(runs: Sequence[Curves], out: Path) -> None:
 def main(args: Args) -> None:
     """Draw all runs side by side."""
     with one_line_errors():
+        if not args.runs:
+            raise ValueError("no runs are given: name one or more folders of train/ppo.py")
         runs = [read(folder) for folder in args.runs]
         args.out.parent.mkdir(parents=True, exist_ok=True)
     draw(runs, args.out)

@@ -24,11 +24,13 @@ from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from deploy.estimator import EstimatorCfg  # noqa: E402
+from hmc.cfg import load  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 from tools import study  # noqa: E402
+from tools.closed_loop import RunCfg, policies  # noqa: E402
 from tools.estimators.chi2 import band  # noqa: E402
 from tools.estimators.figure import draw  # noqa: E402
-from tools.estimators.measure import FILTERS, NEES, Job, Score, measure  # noqa: E402
+from tools.estimators.measure import FILTERS, NEES, SETTLE, Job, Score, measure  # noqa: E402
 from tools.estimators.sensors import SensorCfg  # noqa: E402
 from tools.estimators.simulate import MOTIONS  # noqa: E402
 
@@ -137,6 +139,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     return view
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Run what is missing, print, write."""
     with one_line_errors():
@@ -145,7 +148,16 @@ def main(args: Args) -> int:
                 if item not in known:
                     raise ValueError(f"{item!r}: expected one of {', '.join(known)}")
         cfg = StudyCfg()
-        scores_at = study.folder_of(args.out, cfg, args.resume) / "scores.csv"
+        study.at_least_one(args, "seeds")
+        if not jobs(args):
+            raise ValueError("nothing to compare: --motions and --filters take one or more each")
+        if args.seconds <= SETTLE:
+            raise ValueError(
+                f"seconds must be more than {SETTLE:g}, of which no figure counts, got {args.seconds:g}"
+            )
+        flip = ROOT / "cfg" / "flip.toml"
+        files = flip, *policies(load(flip, RunCfg).task)
+        scores_at = study.folder_of(args.out, cfg, Score, args.resume, files) / "scores.csv"
     console = Console()
     scores = study.carry_out(partial(work, cfg), jobs(args), scores_at, Score, args, console)
     if scores is None:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from hmc import Plan
+from tools.study import whole
 
 COLORS = {
     "foot": "#4c9f70",
@@ -125,7 +126,7 @@ def _bands(axis: Axes, modes: Sequence[str], dt: float) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    partial = path.with_suffix(".partial.png")
-    figure.savefig(partial, dpi=130)
+    """Write a figure, in the format of the file's name, and close it."""
+    with whole(path) as partial:
+        figure.savefig(partial, dpi=130)
     plt.close(figure)
-    partial.replace(path)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
-import os
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,8 @@ from hmc.go2.observe import pitch  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
 from tools import figures, render  # noqa: E402
 from tools.closed_loop import Run, RunCfg, planned, run  # noqa: E402
-from tools.study import write_json  # noqa: E402
+from tools.pool import ENDS, cores, kill_is_ctrl_c, pool_of, results, stop, stop_at_once, why  # noqa: E402
+from tools.study import at_least_one, write_json  # noqa: E402
 
 
 def _work(cfg: RunCfg, seed: int, notes: Any) -> Run:
@@ -51,16 +50,15 @@ def run_all(cfg: RunCfg, seeds: Sequence[int], processes: int, console: Console)
         TextColumn("{task.fields[note]}"),
         TimeElapsedColumn(),
     )
-    context = multiprocessing.get_context("spawn")
     with (
-        context.Manager() as manager,
+        multiprocessing.get_context("spawn").Manager() as manager,
         Progress(*columns, console=console) as bar,
-        ProcessPoolExecutor(min(processes, len(seeds)), mp_context=context) as pool,
+        pool_of(min(processes, len(seeds))) as pool,
     ):
         notes = manager.Queue()
         total = round(cfg.seconds / DT)
         jobs = {seed: bar.add_task(f"seed {seed}", total=total, note="", start=False) for seed in seeds}
-        waiting = {pool.submit(_work, cfg, seed, notes) for seed in seeds}
+        waiting = {pool.submit(stop_at_once, _work, cfg, seed, notes) for seed in seeds}
         try:
             while waiting:
                 ended, waiting = wait(waiting, timeout=0.2)
@@ -70,11 +68,9 @@ def run_all(cfg: RunCfg, seeds: Sequence[int], processes: int, console: Console)
                     bar.update(jobs[seed], completed=done, note=note)
                     if not console.is_terminal and done % 50 == 0:
                         console.print(f"seed {seed}: step {done} of {total}, {note}", highlight=False)
-                yield from (future.result() for future in ended)
+                yield from results(ended)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
+            stop(pool)
             raise
 
 
@@ -159,23 +155,30 @@ class Args:
     video: bool = True
     set: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        cores(self.processes)
+
 
 def main(args: Args) -> int:
     """Run all seeds, write everything, return the exit status."""
     with one_line_errors():
+        at_least_one(args, "seeds")
         cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
         flip_task(cfg.task)  # what is wrong with a policy file shows here
         args.out.mkdir(parents=True, exist_ok=True)
     console = Console()
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     runs: list[Run] = []
-    with contextlib.suppress(KeyboardInterrupt):
-        for done in run_all(cfg, seeds, args.processes or os.cpu_count() or 1, console):
-            runs.append(done)
-            write_run(args.out, done, flip_task(cfg.task), cfg, args.video, console)
+    try:
+        with kill_is_ctrl_c():
+            for done in run_all(cfg, seeds, cores(args.processes), console):
+                with one_line_errors():  # such as of a full disk
+                    write_run(args.out, done, flip_task(cfg.task), cfg, args.video, console)
+                runs.append(done)
+    except ENDS as end:
+        console.print(f"{why(end)} with {len(runs)} of {len(seeds)} runs done")
     runs.sort(key=lambda done: done.seed)
     if not runs:
-        console.print("stopped before the first run ended: nothing written")
         return 1
     summary = summarise(runs)
     write_json(args.out / "summary.json", summary)

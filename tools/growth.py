@@ -24,14 +24,13 @@ import torch  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from hmc.cfg import load  # noqa: E402
+from hmc.cfg import override  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, stance_cost, timeline  # noqa: E402
 from tools import figures, study  # noqa: E402
-from tools.closed_loop import RunCfg, planned, run, study_cfg  # noqa: E402
+from tools.closed_loop import RunCfg, planned, policies, run, study_cfg  # noqa: E402
 
 IDLE = ("stand", "getup", "home", "crouch")  # in the order in which modes without use come in
-FLIP = ROOT / "cfg" / "flip.toml"
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def settings(cfg: GrowthCfg, job: Job) -> RunCfg:
         item = f"task.idle={json.dumps(IDLE[: round(job.value) - 3])}"
     else:
         item = f"{factor.key}={job.value:g}"
-    return load(FLIP, RunCfg, (*cfg.base, *factor.set, item))
+    return override(cfg.flip, (*factor.set, item))
 
 
 def work(cfg: GrowthCfg, job: Job) -> Row:
@@ -212,13 +211,14 @@ class Args(study.Workers):
     set: tuple[str, ...] = ()
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Do what is left of the study, write everything."""
     with one_line_errors():
         cfg = study_cfg(ROOT / "cfg" / "growth.toml", GrowthCfg, args.set)
-        for factor in cfg.factors:
-            settings(cfg, Job(factor.name, factor.values[0], 0))  # what is wrong with a key shows here
-        folder = study.folder_of(args.out, cfg, args.resume)
+        study.at_least_one(cfg, "trials")
+        tasks = [settings(cfg, job).task for job in jobs(cfg)]  # what is wrong with a key shows here
+        folder = study.folder_of(args.out, cfg, Row, args.resume, policies(*tasks))
     console = Console()
     rows = study.carry_out(partial(work, cfg), jobs(cfg), folder / "rows.csv", Row, args, console)
     if rows is None:

@@ -25,13 +25,15 @@ import tyro  # noqa: E402
 from matplotlib.colors import ListedColormap  # noqa: E402
 from matplotlib.patches import Patch  # noqa: E402
 from rich.console import Console  # noqa: E402
+from torch import Tensor  # noqa: E402
 
 from hmc import Budget, Evaluator, Plan, Schedule, Start, Switch, SwitchSpace, Task, make_start, plan  # noqa: E402
 from hmc.cfg import load, override  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
+from hmc.running import Running  # noqa: E402
 from hmc.tasks.cartpole import CartpoleCfg, cartpole, initial_state  # noqa: E402
-from tools.closed_loop import RunCfg  # noqa: E402
+from tools.closed_loop import RunCfg, disturbed_start  # noqa: E402
 from tools.figures import save, search  # noqa: E402
 
 BARRED, DIVERGED = "#222222", "#e0c341"
@@ -44,8 +46,8 @@ class Args:
     Attributes:
         log: seed_*.json of tools/flip.py, where the task is the flip.
         task: flip, or cartpole, whose plan is made here.
-        step: of the flip, the control step whose search is shown; not one in the jump, whose memory is not in
-            the log. Of a plan, how many accepted steps are in the schedule that is shown.
+        step: of the flip, the control step whose search is shown. Of a plan, how many accepted steps are in
+            the schedule that is shown.
         out: picture to write; default: beside the log, or in out.
         worlds: rolled out together.
         control_steps: budget of the cartpole's plan.
@@ -150,18 +152,13 @@ def reason(before: Mapping[str, float], after: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:+.4g}" for name, value in ordered)
 
 
-def read(path: Path, step: int) -> dict[str, Any]:
-    """A step's record."""
+def read(path: Path, step: int) -> tuple[int, list[dict[str, Any]]]:
+    """A run's seed, and its records up to that of a step."""
     log = json.loads(path.read_text(encoding="utf-8"))
     steps: list[dict[str, Any]] = log["steps"]
     if not 0 <= step < len(steps):
         raise ValueError(f"{path} has steps 0 to {len(steps) - 1}, got --step {step}")
-    entry = steps[step]
-    if "jump" in (entry["mode"], steps[max(0, step - 1)]["mode"]):
-        raise ValueError(
-            f"{path}: step {step} is in the jump, whose memory is not in the log: take another one"
-        )
-    return {**entry, "before": steps[max(0, step - 1)], "seed": log["seed"]}
+    return log["seed"], steps[: step + 1]
 
 
 def parse(line: str, names: tuple[str, ...]) -> Schedule:
@@ -174,14 +171,32 @@ def of_log(args: Args) -> tuple[Task, Start, Schedule]:
     """A flip's step: the task with the run's own noise, the state, and the plan that came of it."""
     if args.log is None:
         raise ValueError("the flip's search is read from a log: give seed_*.json of tools/flip.py")
-    entry = read(args.log, args.step)
-    task = flip_task(load(ROOT / "cfg" / "flip.toml", RunCfg, args.set).task, seed=entry["seed"])
-    schedule = parse(entry["schedule"], task.modes.names)
+    seed, steps = read(args.log, args.step)
+    cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
+    task = flip_task(cfg.task, seed=seed)
+    schedule = parse(steps[-1]["schedule"], task.modes.names)
     if len(schedule) != task.horizon:
         raise ValueError(f"{args.log} was planned over {len(schedule)} steps: give --set task.horizon=...")
-    before = entry["before"]
-    start = make_start(task, task.make_sim(1), entry["x"], before["u"], before["mode"], k=args.step)
-    return task, start, schedule
+    return task, start_of(task, steps, disturbed_start(cfg.start, seed)[1]), schedule
+
+
+@torch.no_grad()
+def start_of(task: Task, steps: list[dict[str, Any]], u: Tensor) -> Start:
+    """Where the last of these steps was planned from; `u` is the input before the first, (nu,).
+
+    What the running mode remembers is not in the log: it runs again from where it was entered, which gives
+    the same but for the log's six digits.
+    """
+    k = len(steps) - 1
+    names, states = [entry["mode"] for entry in steps], [torch.tensor(entry["x"]).double() for entry in steps]
+    inputs = [u, *(torch.tensor(entry["u"]).double() for entry in steps)]
+    entered = k
+    while entered > 0 and names[entered - 1] == names[k - 1]:
+        entered -= 1
+    now = Running(task.modes)
+    for at in range(entered, k):
+        now.act(task.modes.index(names[at]), states[at], inputs[at], at)
+    return make_start(task, task.make_sim(1), states[k], inputs[k], now.mode, now.memory, k, ran=now.ran)
 
 
 def of_cartpole(args: Args, console: Console) -> tuple[Task, Start, Plan]:

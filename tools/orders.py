@@ -26,7 +26,7 @@ from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
 from hmc.solvers import ORDERS  # noqa: E402
 from tools import cartpole_study, study  # noqa: E402
-from tools.closed_loop import RunCfg, planned, run, study_cfg  # noqa: E402
+from tools.closed_loop import RunCfg, planned, policies, run, split, study_cfg  # noqa: E402
 
 PARTS = {"solve": "cartpole, one horizon", "loop": "cartpole, receding", "flip": "flip"}
 
@@ -72,6 +72,13 @@ class Row:
     cost: float
     control_steps: float
     success: bool
+
+
+def settings(items: tuple[str, ...]) -> OrdersCfg:
+    """Of the files, with overrides."""
+    own, pole = split(items, "cartpole.")
+    cfg = study_cfg(ROOT / "cfg" / "orders.toml", OrdersCfg, own)
+    return replace(cfg, cartpole=load(ROOT / "cfg" / "cartpole.toml", cartpole_study.StudyCfg, pole))
 
 
 def jobs(cfg: OrdersCfg) -> list[Job]:
@@ -131,19 +138,21 @@ class Args(study.Workers):
 
     Attributes:
         out: folder to write to; a study that was stopped goes on from what is there.
-        set: overrides of cfg/orders.toml, such as seeds=1.
+        set: overrides of cfg/orders.toml, such as seeds=1; with flip. or cartpole. before it, of these files.
     """
 
     out: Path = ROOT / "out" / "orders"
     set: tuple[str, ...] = ()
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Do what is left of the study, write everything."""
     with one_line_errors():
-        cfg = study_cfg(ROOT / "cfg" / "orders.toml", OrdersCfg, args.set)
-        cfg = replace(cfg, cartpole=load(ROOT / "cfg" / "cartpole.toml", cartpole_study.StudyCfg))
-        folder = study.folder_of(args.out, replace(cfg, seeds=0), args.resume)  # more of them come on top
+        cfg = settings(args.set)
+        study.at_least_one(cfg, "seeds")
+        known = replace(cfg, seeds=0)  # more of them come on top
+        folder = study.folder_of(args.out, known, Row, args.resume, policies(cfg.flip.task))
     console = Console()
     rows = study.carry_out(partial(work, cfg), jobs(cfg), folder / "rows.csv", Row, args, console)
     if rows is None:

@@ -24,14 +24,13 @@ from rich.table import Table  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 from hmc import Evaluator, Schedule, SwitchSpace, make_start  # noqa: E402
-from hmc.cfg import load  # noqa: E402
+from hmc.cfg import override  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, stance_cost, timeline  # noqa: E402
 from hmc.sim.ids import Ids  # noqa: E402
 from tools import study  # noqa: E402
-from tools.closed_loop import RunCfg, disturbed_start, planned, run, study_cfg  # noqa: E402
+from tools.closed_loop import RunCfg, disturbed_start, planned, policies, run, study_cfg  # noqa: E402
 
-FLIP = ROOT / "cfg" / "flip.toml"
 STAGES = ("foot_stand", "jump_flip", "handstand")
 
 
@@ -106,7 +105,7 @@ def jobs(cfg: StudyCfg) -> list[Job]:
 def settings(cfg: StudyCfg, name: str) -> RunCfg:
     """Those of runs that are planned on a model."""
     model = next(each for each in cfg.models if each.name == name)
-    return load(FLIP, RunCfg, (*cfg.base, *model.set))
+    return override(cfg.flip, model.set)
 
 
 def work(cfg: StudyCfg, job: Job) -> Row:
@@ -200,19 +199,23 @@ class Args(study.Workers):
     set: tuple[str, ...] = ()
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Do what is left of the study, write everything."""
     with one_line_errors():
         cfg = study_cfg(ROOT / "cfg" / "planning_model.toml", StudyCfg, args.set)
-        for model in cfg.models:
-            settings(cfg, model.name)  # what is wrong with a key shows here
-        folder = study.folder_of(args.out, replace(cfg, trials=0), args.resume)  # more trials come on top
+        study.at_least_one(cfg, "trials", "worlds", "repeats")
+        tasks = [
+            settings(cfg, model.name).task for model in cfg.models
+        ]  # what is wrong with a key shows here
+        known = replace(cfg, trials=0)  # more trials come on top
+        folder = study.folder_of(args.out, known, Row, args.resume, policies(*tasks))
     console = Console()
-    known = folder / "speed.json"
-    if not known.exists():
-        with console.status("the engine's speed on each model"):
-            study.write_json(known, speeds(cfg))
-    fast = json.loads(known.read_text(encoding="utf-8"))
+    measured = folder / "speed.json"
+    if not measured.exists():
+        with study.alone(folder), console.status("the engine's speed on each model"):
+            study.write_json(measured, speeds(cfg))
+    fast = json.loads(measured.read_text(encoding="utf-8"))
     rows = study.carry_out(partial(work, cfg), jobs(cfg), folder / "rows.csv", Row, args, console)
     if rows is None:
         return 1

@@ -23,6 +23,7 @@ from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, make_sim  # noqa: E402
 from tools.closed_loop import RunCfg  # noqa: E402
 from tools.jump_guess import settled_stands  # noqa: E402
+from tools.study import at_least_one  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,9 @@ def main(args: Args) -> None:
     """Jump, keep, write."""
     torch.manual_seed(args.seed)
     with one_line_errors():
+        at_least_one(args, "states")
+        if not 0 <= args.first <= args.last:
+            raise ValueError(f"first and last: expected 0 <= first <= last, got {args.first} and {args.last}")
         cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
         task = flip_task(cfg.task, seed=args.seed, threads=args.threads)
         sim = make_sim(args.states, threads=args.threads)

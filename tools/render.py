@@ -19,7 +19,8 @@ sys.path.insert(0, str(ROOT))
 
 import tyro  # noqa: E402
 
-from hmc.cli import command_line  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
+from tools.study import at_least_one  # noqa: E402
 
 BACKENDS = ("egl", "osmesa", "glfw")
 EVERY = 2  # control steps a picture: without a GPU a picture takes a core 0.1 s
@@ -59,13 +60,34 @@ def render_run(args: Args) -> str:
     return f"no video: OpenGL is missing here ({reason}); everything else is written"
 
 
-def main(args: Args) -> None:
-    """Render one run: a video and a strip of frames beside its log."""
+def main(args: Args) -> int:
+    """Render one run: a video and a strip of frames beside its log; return the exit status."""
     if args.backend:
         os.environ["MUJOCO_GL"] = args.backend  # read when mujoco is imported
         draw(args)
-    else:
-        print(render_run(args) or f"{args.log.with_suffix('.mp4')} and {args.log.with_suffix('.png')}")
+        return 0
+    with one_line_errors():
+        at_least_one(args, "frames", "width", "height")
+        read(args.log)
+    failed = render_run(args)
+    print(failed or f"{args.log.with_suffix('.mp4')} and {args.log.with_suffix('.png')}")
+    return 1 if failed else 0
+
+
+def read(log: Path) -> list[dict[str, Any]]:
+    """The records of a run, of each step that is shown.
+
+    Raises:
+        ValueError: it is no run's log.
+        OSError: it cannot be read.
+    """
+    try:
+        steps: list[dict[str, Any]] = json.loads(log.read_text(encoding="utf-8"))["steps"][::EVERY]
+        if all(len(step["x"]) == 37 and step["mode"] for step in steps) and steps:
+            return steps
+    except (ValueError, LookupError, TypeError):
+        pass
+    raise ValueError(f"{log}: expected the log of a run, seed_*.json of tools/flip.py or a play.json")
 
 
 def draw(args: Args) -> None:
@@ -73,8 +95,7 @@ def draw(args: Args) -> None:
     import imageio.v2 as imageio
     import numpy as np
 
-    steps = json.loads(args.log.read_text(encoding="utf-8"))["steps"]
-    steps = steps[::EVERY]
+    steps = read(args.log)
     states = np.array([step["x"] for step in steps])
     video = args.log.with_suffix(".mp4")
     partial = video.with_suffix(".partial.mp4")
@@ -93,12 +114,13 @@ def draw(args: Args) -> None:
 
 def strip_steps(modes: list[str], frames: int) -> list[int]:
     """Pictures to show: evenly over the run, or if it begins in the foot stand, over the flip."""
+    shares = [i / max(1, frames - 1) for i in range(frames)]
     if modes[0] != "foot" or len(set(modes)) == 1:
-        return sorted({round((len(modes) - 1) * i / (frames - 1)) for i in range(frames)})
+        return sorted({round((len(modes) - 1) * share) for share in shares})
     jump = next(step for step, mode in enumerate(modes) if mode != "foot")
     first = max(jump - 6 // EVERY, 0)
     last = min(first + 64 // EVERY, len(modes) - 1)
-    return sorted({round(first + (last - first) * i / (frames - 1)) for i in range(frames)})
+    return sorted({round(first + (last - first) * share) for share in shares})
 
 
 def images(states: NDArray[Any], width: int, height: int, samples: int) -> Iterator[NDArray[Any]]:
@@ -109,6 +131,8 @@ def images(states: NDArray[Any], width: int, height: int, samples: int) -> Itera
 
     model = load_model()
     model.vis.quality.offsamples = samples
+    room = model.vis.global_  # of the pictures that can be drawn
+    room.offwidth, room.offheight = max(room.offwidth, width), max(room.offheight, height)
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
     camera.distance, camera.azimuth, camera.elevation = 2.0, 90.0, -8.0
@@ -124,4 +148,4 @@ def images(states: NDArray[Any], width: int, height: int, samples: int) -> Itera
 
 
 if __name__ == "__main__":
-    main(command_line(Args))
+    sys.exit(main(command_line(Args)))

@@ -26,7 +26,7 @@ from rich.table import Table  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task  # noqa: E402
 from tools import figures, study  # noqa: E402
-from tools.closed_loop import study_cfg  # noqa: E402
+from tools.closed_loop import policies, study_cfg  # noqa: E402
 from tools.robustness_study import PLANNERS, RobustnessCfg, Row, jobs, work  # noqa: E402
 from train.score import Score  # noqa: E402
 
@@ -88,13 +88,17 @@ class Args(study.Workers):
     set: tuple[str, ...] = ()
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Run what is missing; write summary, table and figure."""
     console = Console()
     with one_line_errors():
         cfg = study_cfg(ROOT / "cfg" / "robustness.toml", RobustnessCfg, args.set)
         flip_task(cfg.flip.task)  # what is wrong with a policy file shows here
-        table = study.folder_of(args.out, cfg, args.resume) / "results.csv"
+        if not jobs(cfg):
+            raise ValueError("trials and sweep_trials, or the sweeps, leave nothing to do: ask for some runs")
+        files = policies(cfg.flip.task)
+        table = study.folder_of(args.out, cfg, Row, args.resume, files) / "results.csv"
     rows = study.carry_out(partial(work, cfg), jobs(cfg), table, Row, args, console)
     if rows is None:
         return 1

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import json
-import os
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
@@ -142,9 +141,8 @@ def work(cfg: SeedsCfg, folder: Path, job: Job) -> Trained:
 def keep(folder: Path, made: Trained) -> Row:
     """Write a seed's policy and curves into `folder`; its row."""
     name = f"seed_{made.row.job.seed}"
-    partial = folder / f"{name}.onnx.partial"
-    partial.write_bytes(made.policy)
-    os.replace(partial, folder / f"{name}.onnx")
+    with study.whole(folder / f"{name}.onnx") as policy:
+        policy.write_bytes(made.policy)
     lines = {tag: [part.tolist() for part in line] for tag, line in made.curve.lines.items()}
     found = {"title": made.curve.title, "batch": made.curve.batch, "lines": lines}
     study.write_json(folder / f"{name}.json", found)
@@ -218,20 +216,21 @@ def settings(args: Args) -> SeedsCfg:
         near = difflib.get_close_matches(args.mode, PROTOCOLS, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"unknown mode {args.mode!r}: expected one of {', '.join(PROTOCOLS)}{hint}")
-    for name in ("seeds", "episodes"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(args, name)}")
+    study.at_least_one(args, "seeds", "episodes")
     training = dump(read_training(args.mode, args.mode, args.set))
     return SeedsCfg(args.mode, training, args.episodes, args.set)
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Train, export and measure what is missing."""
     console = Console()
     with one_line_errors():
         cfg = settings(args)
         out = (args.out or ROOT / "out" / "seeds" / args.mode).resolve()
-        folder = study.folder_of(out, cfg, args.resume)
+        env: Any = read_training(args.mode, args.mode, args.set).env
+        records = getattr(env.starts, "records", "")
+        folder = study.folder_of(out, cfg, Row, args.resume, [ROOT / records] if records else [])
     tell = partial(publish, cfg, folder, out)
     jobs = [Job(seed) for seed in range(1, args.seeds + 1)]
     do, receive = partial(work, cfg, folder), partial(keep, folder)

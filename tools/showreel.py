@@ -29,7 +29,8 @@ from hmc.go2.stances import HOLDS  # noqa: E402
 from hmc.receding import SearchCfg  # noqa: E402
 from tools import figures, render  # noqa: E402
 from tools.closed_loop import MODEL, RunCfg, study_cfg  # noqa: E402
-from tools.study import Workers, run_all, write_json  # noqa: E402
+from tools.pool import ENDS, kill_is_ctrl_c, why  # noqa: E402
+from tools.study import Workers, at_least_one, run_all, write_json  # noqa: E402
 
 ARRIVED = 0.3  # m: so near to its place a robot is there
 HOLD = 0.5  # s that a goal is held without a break, to be reached; the last one, at the end of its time
@@ -250,6 +251,7 @@ class Args(Workers):
 def main(args: Args) -> int:
     """Run all seeds, write everything, return the exit status."""
     with one_line_errors():
+        at_least_one(args, "seeds")
         cfg = study_cfg(ROOT / "cfg" / "showreel.toml", ReelCfg, args.set)
         cfg.make_task()  # what is wrong with a policy file shows here
         args.out.mkdir(parents=True, exist_ok=True)
@@ -257,11 +259,13 @@ def main(args: Args) -> int:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     runs: list[Reel] = []
     try:
-        for done in run_all(partial(reel, cfg), seeds, args, console):
-            runs.append(done)
-            write_reel(args.out, done, cfg, args.video, console)
-    except KeyboardInterrupt:
-        console.print(f"stopped with {len(runs)} of {len(seeds)} runs done")
+        with kill_is_ctrl_c():
+            for done in run_all(partial(reel, cfg), seeds, args, console):
+                with one_line_errors():  # such as of a full disk
+                    write_reel(args.out, done, cfg, args.video, console)
+                runs.append(done)
+    except ENDS as end:
+        console.print(f"{why(end)} with {len(runs)} of {len(seeds)} runs done")
     runs.sort(key=lambda done: done.seed)
     if not runs:
         return 1

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import fcntl
+import functools
 import hashlib
 import json
-import multiprocessing
 import os
 import shutil
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar, get_type_hints
@@ -22,6 +23,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from hmc.cfg import dump
 from hmc.cli import one_line_errors
 from tools import cluster
+from tools.pool import ENDS, cores, kill_is_ctrl_c, on_processes, why
 
 PARSERS: dict[Any, Callable[[str], Any]] = {str: str, int: int, float: float, bool: "True".__eq__}
 
@@ -37,6 +39,7 @@ class Row(Protocol):
 
 
 R = TypeVar("R", bound=Row)
+A = TypeVar("A")
 
 # --ray alone or with an address; a str, empty without one
 ADDRESS = PrimitiveConstructorSpec(
@@ -63,28 +66,91 @@ class Workers:
     ray: Annotated[str, ADDRESS] | None = None
     resume: bool = True
 
+    def __post_init__(self) -> None:
+        cores(self.processes)
+
     @property
     def cores(self) -> int:
         """Jobs at the same time on this machine."""
-        return self.processes or os.cpu_count() or 1
+        return cores(self.processes)
 
 
-def folder_of(out: Path, cfg: Any, resume: bool = True) -> Path:
+def at_least_one(of: Any, *names: str) -> None:
+    """Raise a ValueError unless these counts, of settings or of a command line, are 1 or more."""
+    for name in names:
+        if getattr(of, name) < 1:
+            raise ValueError(f"{name} must be at least 1, got {getattr(of, name)}")
+
+
+def folder_of(
+    out: Path, cfg: Any, kind: Callable[..., Row], resume: bool = True, files: Iterable[Path] = ()
+) -> Path:
     """Where the table of a study under these settings grows; others begin anew, this one without `resume`.
+
+    Args:
+        out: folder of all studies of a kind.
+        cfg: settings.
+        kind: of the rows; those of other fields are another study's.
+        resume: go on from what is there.
+        files: that the work reads, such as policies: what is in them counts like a setting.
 
     Raises:
         ValueError: nothing can be written there.
+        OSError: one of `files` cannot be read.
     """
-    folder = out / hashlib.sha256(dump(cfg).encode()).hexdigest()[:12]
+    known = hashlib.sha256(dump(cfg).encode())
+    columns: tuple[Any, ...] = _job_of(kind), kind
+    known.update(" ".join(each.name for of in columns for each in fields(of)).encode())
+    for file in files:
+        known.update(hashlib.sha256(file.read_bytes()).digest())
+    folder = out / known.hexdigest()[:12]
     try:
-        if not resume and folder.exists():
-            shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            with alone(folder):
+                shutil.rmtree(folder)
+                folder.mkdir()
         (folder / ".probe").write_text("", encoding="utf-8")
         (folder / ".probe").unlink()
     except OSError as error:
         raise ValueError(f"cannot write into {folder} ({error}): choose another folder with --out") from error
     return folder
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Work in `folder` while no other run does; where one does, a line that says so ends the program."""
+    with (folder / ".lock").open("w", encoding="utf-8") as lock:
+        with one_line_errors():
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueError(
+                    f"another run works in {folder}: wait for it, or take another folder with --out"
+                ) from None
+            except OSError:
+                pass  # a file system without locks: two runs cost time there, and no file
+        yield
+
+
+def stoppable(main: Callable[[A], int]) -> Callable[[A], int]:
+    """A study's program that Ctrl-C, `kill` or a full disk end in a line that says how it goes on."""
+
+    @functools.wraps(main)
+    def program(args: A) -> int:
+        try:
+            with kill_is_ctrl_c():
+                return main(args)
+        except ENDS as end:
+            print(f"{why(end)}: the same command goes on from there", file=sys.stderr)
+            return 1
+        except OSError as error:
+            if os.environ.get("HMC_TRACEBACK"):
+                raise
+            print(f"error: {error}: mend that, and the same command goes on from there", file=sys.stderr)
+            return 2
+
+    return program
 
 
 def _itself(row: Any) -> Any:
@@ -105,7 +171,9 @@ def carry_out(
     receive: Callable[[Any], R] = _itself,
     tell: Callable[[list[R]], None] = _nobody,
 ) -> list[R] | None:
-    """Do what the table lacks; all rows in the order of the jobs, or None when stopped by Ctrl-C.
+    """Do what the table lacks; all rows in the order of the jobs, or None when stopped or a worker was lost.
+
+    Rows of other jobs stay in the table: a part of a study does not undo the rest.
 
     Args:
         work: what makes a row of a job, in a process of its own that may be on another machine; a job whose
@@ -119,19 +187,20 @@ def carry_out(
             here, because another machine has other folders.
         tell: told the rows so far, in the order of the jobs, whenever one is added.
     """
-    rows = {row.job: row for row in read(table, kind)} if table.exists() else {}
-    todo = [job for job in jobs if job not in rows]
-    try:
-        for row in map(receive, run_all(work, todo, workers, console)):
-            rows[row.job] = row
-            found = [rows[job] for job in jobs if job in rows]
-            write(table, found)
-            tell(found)
-    except KeyboardInterrupt:
-        done = sum(job in rows for job in jobs)
-        console.print(f"stopped with {done} of {len(jobs)} done: the same command goes on from there")
-        return None
-    return [rows[job] for job in jobs]
+    with alone(table.parent):
+        rows = {row.job: row for row in read(table, kind)} if table.exists() else {}
+        todo, asked = [job for job in jobs if job not in rows], set(jobs)
+        try:
+            for row in map(receive, run_all(work, todo, workers, console)):
+                rows[row.job] = row
+                found = [rows[job] for job in jobs if job in rows]
+                write(table, [*found, *(row for job, row in rows.items() if job not in asked)])
+                tell(found)
+        except ENDS as end:
+            done = sum(job in rows for job in jobs)
+            console.print(f"{why(end)} with {done} of {len(jobs)} done: the same command goes on from there")
+            return None
+        return [rows[job] for job in jobs]
 
 
 def run_all(
@@ -156,26 +225,14 @@ def run_all(
         yield from bar.track(done, total=len(todo), description="the study")
 
 
-def on_processes(work: Callable[[Any], Any], todo: Sequence[Any], processes: int) -> Generator[Any]:
-    """What comes of the jobs, as it comes, from a pool of processes."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        waiting = {pool.submit(work, job) for job in todo}
-        try:
-            while waiting:
-                ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in ended:
-                    yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+def _job_of(kind: Callable[..., Row]) -> Any:
+    """The class of a row's job."""
+    return get_type_hints(kind)["job"]
 
 
 def read(path: Path, kind: Callable[..., R]) -> list[R]:
     """The rows of a table."""
-    made = get_type_hints(kind)["job"]
+    made = _job_of(kind)
 
     def values(of: Any, line: dict[str, str]) -> dict[str, Any]:
         types = get_type_hints(of)
@@ -188,17 +245,25 @@ def read(path: Path, kind: Callable[..., R]) -> list[R]:
 
 def write(path: Path, rows: Sequence[Any]) -> None:
     """A table that is either whole or not there."""
-    partial = path.with_name(path.name + ".partial")
     lines = [{**values.pop("job"), **values} for values in map(asdict, rows)]
-    with partial.open("w", newline="", encoding="utf-8") as file:
+    with whole(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
-    os.replace(partial, path)
 
 
 def write_json(path: Path, data: Any) -> None:
     """Write a file that is either whole or not there."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    with whole(path) as partial:
+        partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A file of this process alone to write to, of the same kind, which then takes the place of `path`."""
+    partial = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

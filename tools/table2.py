@@ -21,9 +21,9 @@ from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from hmc.cli import command_line, one_line_errors  # noqa: E402
-from hmc.go2.task import flip_task  # noqa: E402
+from hmc.go2.task import flip_task, policy_path  # noqa: E402
 from tools import study, table2_figures  # noqa: E402
-from tools.closed_loop import study_cfg  # noqa: E402
+from tools.closed_loop import policies, study_cfg  # noqa: E402
 from tools.table2_study import (  # noqa: E402
     CONTROLLERS,
     Row,
@@ -47,20 +47,22 @@ COLUMNS = (
 
 def tuned(cfg: Table2Cfg, path: Path, console: Console) -> dict[str, Rule]:
     """The rules of the controllers that have one; what was tuned once is kept in `path`."""
+    found = {"untuned": Rule(0, cfg.untuned)}
     if path.exists():
         kept = json.loads(path.read_text(encoding="utf-8"))
-        return {name: Rule(**values) for name, values in kept.items()}
-    found = {"untuned": Rule(0, cfg.untuned)}
+        found |= {name: Rule(**values) for name, values in kept.items()}
     grids = (
         ("sequence", sequences(cfg), None),
         ("pitch", switches(cfg), None),
         ("ppo", orders(cfg), told(cfg)),
     )
     for name, rules, modes in grids:
+        if name in found:
+            continue
         with console.status(f"tuning: {CONTROLLERS[name]}, {len(rules)} rules"):
             found[name], cost = tune(cfg, rules, modes)
         console.print(f"{CONTROLLERS[name]}: {found[name]}, mean cost {cost:.2f}", highlight=False)
-    study.write_json(path, {name: asdict(rule) for name, rule in found.items()})
+        study.write_json(path, {name: asdict(rule) for name, rule in found.items()})
     return found
 
 
@@ -110,6 +112,7 @@ class Args(study.Workers):
     set: tuple[str, ...] = ()
 
 
+@study.stoppable
 def main(args: Args) -> int:
     """Run what is missing; write tables and figures."""
     console = Console()
@@ -117,9 +120,12 @@ def main(args: Args) -> int:
         cfg = study_cfg(ROOT / "cfg" / "table2.toml", Table2Cfg, args.set)
         flip_task(cfg.flip.task)  # what is wrong with a policy file shows here
         told(cfg)
-        folder = study.folder_of(args.out, cfg, args.resume)
+        study.at_least_one(cfg, "trials")
+        files = *policies(cfg.flip.task), policy_path("unified", cfg.unified)
+        folder = study.folder_of(args.out, cfg, Row, args.resume, files)
     (folder / "runs").mkdir(exist_ok=True)
-    rules = tuned(cfg, folder / "rules.json", console)
+    with study.alone(folder):
+        rules = tuned(cfg, folder / "rules.json", console)
     do, receive = partial(work, cfg, rules), partial(keep, folder / "runs")
     rows = study.carry_out(do, jobs(cfg), folder / "results.csv", Row, args, console, receive)
     if rows is None:

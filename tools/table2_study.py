@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -21,6 +20,7 @@ from hmc.sampling import METHODS, SamplingCfg
 from hmc.start import make_start
 from hmc.worlds import Worlds, finite
 from tools.closed_loop import Controller, RunCfg, chosen, disturbed_start, planned, run
+from tools.study import whole
 
 CONTROLLERS = {
     "ppo": "one policy, told to flip, tuned",
@@ -249,7 +249,6 @@ def keep(folder: Path, made: tuple[Row, dict[str, np.ndarray]]) -> Row:
     """Write what a run was into `folder`; its row."""
     row, arrays = made
     target = folder / f"{row.job.controller}_{row.job.seed}.npz"
-    partial = target.with_suffix(".partial.npz")
-    np.savez_compressed(partial, allow_pickle=False, **arrays)
-    os.replace(partial, target)
+    with whole(target) as partial:
+        np.savez_compressed(partial, allow_pickle=False, **arrays)
     return row

@@ -193,6 +193,10 @@ class Runner(OnPolicyRunner):
         self.table.update(kwargs, self.logger.ep_extras[0])
         with contextlib.redirect_stdout(io.StringIO()):
             self._log(**kwargs)
+        if (
+            self.logger.writer is not None
+        ):  # an iteration's worlds and processes may be others when it is resumed
+            self.logger.writer.add_scalar("Perf/environment_steps", self.logger.tot_timesteps, kwargs["it"])
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
