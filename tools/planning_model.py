@@ -205,9 +205,8 @@ def main(args: Args) -> int:
     with one_line_errors():
         cfg = study_cfg(ROOT / "cfg" / "planning_model.toml", StudyCfg, args.set)
         study.at_least_one(cfg, "trials", "worlds", "repeats")
-        tasks = [
-            settings(cfg, model.name).task for model in cfg.models
-        ]  # what is wrong with a key shows here
+        # what is wrong with a key shows here
+        tasks = [settings(cfg, model.name).task for model in cfg.models]
         known = replace(cfg, trials=0)  # more trials come on top
         folder = study.folder_of(args.out, known, Row, args.resume, policies(*tasks))
     console = Console()
