@@ -50,7 +50,7 @@ def test_all_spend_the_same(cfg):
                 "a batch may begin below the limit and exceed it"
             )
         assert work(cfg, rows[0].job) == rows[0]
-        with pytest.raises(ValueError, match="order 'tailz'"):  # the order is the search's
+        with pytest.raises(ValueError, match=r"order .*'tailz'"):  # it is the search's
             work(cfg, Job(part, horizon, "tailz", 0))
 
 
