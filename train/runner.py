@@ -193,9 +193,7 @@ class Runner(OnPolicyRunner):
         self.table.update(kwargs, self.logger.ep_extras[0])
         with contextlib.redirect_stdout(io.StringIO()):
             self._log(**kwargs)
-        if (
-            self.logger.writer is not None
-        ):  # an iteration's worlds and processes may be others when it is resumed
+        if self.logger.writer is not None:  # a run that goes on may have other worlds and processes
             self.logger.writer.add_scalar("Perf/environment_steps", self.logger.tot_timesteps, kwargs["it"])
 
 
