@@ -43,7 +43,8 @@ class Silence:
     """Whether something has been silent for too long, counted in looks.
 
     A time in which nobody looked counts as `step`. When the whole machine stood still, what was to be heard
-    did so, too, and gets the time that it has otherwise.
+    did so, too, and gets the time that it has otherwise. That it did so again and again, and let nothing be
+    heard in between, is less and less likely: each such time of one silence counts twice as much as the last.
 
     Attributes:
         heard: when it was heard last [s]; -inf before the first time.
@@ -51,22 +52,25 @@ class Silence:
     Args:
         allowed: silence that is not too long [s].
         most: nor is one of no more than this with what was not looked at [s].
-        step: what counts of the time between two looks, at most [s].
+        step: what counts of the first time between two looks that is longer, at most [s].
     """
 
     def __init__(self, allowed: float, most: float, step: float):
         self.heard = self._looked = -math.inf
         self._allowed, self._most, self._step = allowed, most, step
-        self._counted = 0.0
+        self._counted, self._counts = 0.0, step
 
     def hear(self, t: float) -> None:
         """It was heard at t [s]."""
-        self.heard, self._counted = t, 0.0
+        self.heard, self._counted, self._counts = t, 0.0, self._step
 
     def too_long(self, now: float) -> bool:
         """Whether it is, looking `now` [s]."""
         age = now - self.heard
-        self._counted = min(self._counted + min(now - self._looked, self._step), age)
+        unseen = min(now - self._looked, age)
+        self._counted = min(self._counted + min(unseen, self._counts), age)
+        if unseen > self._counts:
+            self._counts *= 2
         self._looked = now
         return self._counted > self._allowed or age > self._most
 

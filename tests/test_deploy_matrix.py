@@ -47,7 +47,6 @@ TEST_ALSO = {  # with `make test`
     (DAMPING, "states twice"),
 }
 LATE = {
-    **{(phase, "no states, slow turns"): "a turn counts as 10 ms of silence at most" for phase in INTO},
     (HYBRID, "gyroscope off by 1 rad/s"): "nothing but the height contradicts a gyroscope that drifts",
 }
 

@@ -17,6 +17,7 @@ from deploy.codec import encode_state, seal
 from deploy.remote import ABSENT, Button
 from deploy.safety import EMERGENCY, Body, Envelope, Inputs, Machine, Phase, limited, violations
 from deploy.settings import DeployCfg, EnvelopeCfg, InputCfg
+from deploy.timing import Silence
 from hmc.cfg import load
 from hmc.go2 import facts
 from hmc.go2.network import LOWER, UPPER
@@ -340,3 +341,24 @@ def test_random_octets_never_pass():
     nan = bytearray(good(102))
     nan[40:44] = np.float32(np.nan).tobytes()
     assert checks.take(seal(nan), 0.0) is None  # under a good checksum
+
+
+@pytest.mark.parametrize(
+    ("looks", "found"),
+    [
+        (np.arange(1, 100) * 0.002 + 0.001, 0.061),  # all of the time is looked at
+        ([0.15, 0.16, 0.17, 0.18, 0.19, 0.199, 0.201], 0.201),  # 10 ms of the pause count
+        (np.arange(1, 10) * 0.02, 0.08),  # ms that count: 10, 20, 20, 20
+        (np.arange(1, 10) * 0.045, 0.135),  # 10, 20, 40
+        ([0.05, 0.052, 0.102, 0.104, 0.106], None),  # 10, 2, 20, 2, 2
+    ],
+    ids=["busy", "one pause", "slow turns", "pauses", "two pauses"],
+)
+def test_silence(looks: np.ndarray, found: float | None) -> None:
+    """A pause of the machine is no silence; that nothing is ever heard between pauses is one."""
+    silence = Silence(0.06, 0.2, 0.01)
+    for heard in (1.0, 2.0):  # what was counted before it was heard again does not matter
+        silence.hear(heard)
+        silence.too_long(heard)
+        late = (float(t) for t in looks if silence.too_long(heard + float(t)))
+        assert next(late, None) == (found if found is None else pytest.approx(found))
