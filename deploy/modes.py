@@ -83,12 +83,12 @@ class Performer:
         self.plan: Plan | None = None
         self.counts: Counter[str] = Counter()
         self._policies = policies
-        self._next: Plan | None = None
+        self._coming: list[Plan] = []  # in the order of their begins
         self._ran: dict[int, int] = {}
 
     def offer(self, plan: Plan) -> None:
-        """A plan has come: it runs from its begin on, unless a newer one comes before."""
-        self._next = plan
+        """A plan has come: it runs from its begin on, unless a newer one begins before that."""
+        self._coming = [other for other in self._coming if other.begin < plan.begin] + [plan]
 
     def act(self, k: int, x: Array, u: Array) -> Array:
         """Joint targets of tick k [rad], (12,); `take_over` goes before.
@@ -112,11 +112,11 @@ class Performer:
         return self._policies[mode].act(x[None], u[None], self.anchor[None])[0]
 
     def take_over(self, k: int) -> None:
-        """Make the plan that has come the one that runs, if its time has come by tick k."""
-        plan = self._next
-        if plan is None or k < plan.begin:
+        """Make the newest of the plans whose time has come by tick k the one that runs, if it can be."""
+        ripe = [plan for plan in self._coming if plan.begin <= k]
+        if not ripe:
             return
-        self._next = None
+        self._coming, plan = self._coming[len(ripe) :], ripe[-1]
         before = [self._ran.get(tick, NONE) for tick in range(plan.begin - 1, k)]
         if k - plan.begin >= self.cfg.expires:
             self.counts["late"] += 1

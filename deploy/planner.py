@@ -42,7 +42,8 @@ class PlannerCfg:
         rest: horizon of plans in which no flip is looked for, in control steps: before the handstand is asked
             for, and once the robot is in it.
         first: effort of a plan then: the robot stands and can wait.
-        search: effort of every other plan.
+        search: effort of every other plan on the way to it.
+        hold: effort of a plan in the handstand, where a little of it at every plan is as much.
         others: robots that a flip is tried on before it is sent.
         landed: share of them and the nominal one that have to end in the handstand.
         patience: flips in a row that too few land, after which the first way is looked for anew.
@@ -60,6 +61,7 @@ class PlannerCfg:
     commit: bool = True
     first: SearchCfg = field(default_factory=SearchCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
+    hold: SearchCfg = field(default_factory=SearchCfg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +88,8 @@ class Planner:
 
     Attributes:
         task: what is planned while a flip is looked for.
-        seconds: that the last plans took [s].
+        seconds: that the last plans took [s]: those while a flip is looked for, and the others, which take a
+            fraction of it. A flip that is planned for a moment that is over before it comes is of no use.
 
     Args:
         task: settings of the task.
@@ -119,9 +122,9 @@ class Planner:
         self._calm = replace(self.task, horizon=cfg.rest)
         if self.task.modes.names != NAMES:
             raise ValueError(f"modes must be {', '.join(NAMES)}, got {', '.join(self.task.modes.names)}")
-        self.seconds: deque[float] = deque([0.1] * 5, maxlen=30)
+        self.seconds: dict[bool, deque[float]] = {True: deque(maxlen=5), False: deque([0.1] * 5, maxlen=30)}
         self._cfg, self._rules, self._seed = cfg, rules, seed
-        searches = (cfg.first, cfg.search)
+        searches = (cfg.first, cfg.search, cfg.hold)
         self._sim = self.task.make_sim(
             max(worlds_for(self.task, it.samples, 0, it.pairs + it.moves) for it in searches)
         )
@@ -141,10 +144,15 @@ class Planner:
         flip = ([FOOT] * 10 + [JUMP] * 20 + [HAND] * self._horizon)[: self._horizon]
         plan(self.task, start, schedule=flip, sim=self._sim, **self._cfg.search.options())
 
-    @property
-    def ahead(self) -> int:
-        """Ticks that planning is expected to take."""
-        expected = float(np.quantile(self.seconds, self._rules.quantile))
+    def looking(self, state: np.ndarray) -> bool:
+        """Whether a flip is looked for in a state, as of the state's slot."""
+        return int(state["asked"]) >= 0 and int(state["mode"]) == FOOT and self._command is None
+
+    def ahead(self, state: np.ndarray) -> int:
+        """Ticks that planning from a state is expected to take."""
+        if not (last := self.seconds[self.looking(state)]):
+            return self._rules.longest
+        expected = float(np.quantile(last, self._rules.quantile))
         return min(1 + math.ceil(expected / self._tick), self._rules.longest)
 
     def committed(self, state: np.ndarray) -> bool:
@@ -172,7 +180,7 @@ class Planner:
         start, modes = self._predict(state, ahead)
         if not bool(start.x.isfinite().all()):
             return None
-        searching = int(state["asked"]) >= 0 and start.mode == FOOT and self._command is None
+        searching = self.looking(state) and start.mode == FOOT
         if int(state["asked"]) < 0:
             return self._stand(state, begin, start)
         if searching:
@@ -181,7 +189,7 @@ class Planner:
         else:
             command = begin if self._command is None else self._command
             start = replace(start, k=max(0, begin - command + self._wanted))
-            effort = self._cfg.search
+            effort = self._cfg.hold if start.mode == HAND else self._cfg.search
         task = self._calm if start.mode == HAND else self.task
         found = plan(
             task,
@@ -293,11 +301,12 @@ def run(board: Board, planner: Planner, stopped: Callable[[], bool]) -> None:
         last = int(state["k"])
         if planner.committed(state):
             continue
-        record = planner.plan(state, planner.ahead)
+        taken = planner.seconds[planner.looking(state)]
+        record = planner.plan(state, planner.ahead(state))
         now = time.monotonic()
-        planner.seconds.append(now - float(state["t"]))
+        taken.append(now - float(state["t"]))
         if record is not None:
-            record["t"], record["seconds"] = now, planner.seconds[-1]
+            record["t"], record["seconds"] = now, taken[-1]
             board.plan.write(record)
 
 

@@ -31,24 +31,30 @@ CFG = load(Path("cfg/deploy.toml"), DeployCfg)
 
 
 def planner(delay: int, seed: int = 0, *overrides: str) -> Planner:
-    """As deployed, but it reckons with a planning time of so many ticks."""
+    """As deployed, but it begins by reckoning with a planning time of so many ticks."""
     cfg = load(Path("cfg/planner.toml"), PlannerCfg, overrides)
     task = load(Path("cfg/flip.toml"), FlipCfg, cfg.task, table="task")
     made = Planner(task, cfg, CFG.plan, seed=seed, threads=1)
-    made.seconds = deque([delay * DT] * 3)
+    made.seconds[False] = deque([delay * DT], maxlen=5)
     return made
 
 
 class Flight:
-    """A stand-in, its controller and its planner, whose plans take `delay` ticks to come."""
+    """A stand-in, its controller and its planner, whose plans take so many ticks to come.
 
-    def __init__(self, seed: int, delay: int):
+    Args:
+        seed: of robot and draws.
+        delay: of plans.
+        searching: of plans while a flip is looked for.
+    """
+
+    def __init__(self, seed: int, delay: int, searching: int):
         self.robot = StandIn(Settings(seed=seed, start="lying"))
         self.robot.release(True)
         self.control = Control(CFG, policies("", ""))
         self.control.planner = True
         self.planner = planner(delay, seed)
-        self.delay = delay
+        self.delay = {True: searching, False: delay}
         self.x: list[np.ndarray] = []  # true states at the ticks of the hybrid phase
         self.modes: list[int] = []
         self._sent: list[bytes] = []
@@ -92,19 +98,23 @@ class Flight:
             self._coming = None
         state = self.control.situation.copy()
         if self._coming is None and not self.planner.committed(state):
-            self._coming = k + self.delay, self.planner.plan(state, self.planner.ahead)
+            looking = self.planner.looking(state)
+            self._coming = k + self.delay[looking], self.planner.plan(state, self.planner.ahead(state))
+            self.planner.seconds[looking].append(self.delay[looking] * DT)
 
 
 @pytest.mark.parametrize(
-    ("seed", "delay"), [(0, 12), *(pytest.param(seed, 25, marks=pytest.mark.deploy) for seed in range(1, 6))]
+    ("seed", "delay", "searching"),
+    [(0, 3, 25), *(pytest.param(seed, 25, 25, marks=pytest.mark.deploy) for seed in range(1, 6))],
 )
-def test_from_lying_to_the_handstand(seed: int, delay: int) -> None:
-    """With plans that take 0.24 s, and half a second."""
-    flight = Flight(seed, delay).run(25.0)
+def test_from_lying_to_the_handstand(seed: int, delay: int, searching: int) -> None:
+    """With plans that take 0.06 s, and half a second."""
+    flight = Flight(seed, delay, searching).run(25.0)
     found = stages(np.array(flight.x), flight.modes)
     assert found is not None
     assert found["success"], (found, flight.control.machine.reason)
     assert flight.control.missed == 0
+    assert not flight.control.performer.counts["stale"]
     order = [mode for i, mode in enumerate(flight.modes) if i == 0 or mode != flight.modes[i - 1]]
     assert [mode for mode in order if mode != NONE] == [FOOT, JUMP, HAND]
     assert flight.modes.count(JUMP) >= 12  # the rule of cfg/flip.toml
@@ -135,6 +145,15 @@ def test_a_flip_is_left_alone_until_the_handstand_and_given_up_if_it_is_not_take
     assert not it.committed(situation(k=begin + 60, mode=HAND))
     assert not it.committed(situation(k=begin + 60))  # still in the foot stand
     assert not it.committed(situation(k=begin + 1))  # and so the search goes on
+
+
+def test_a_flip_is_planned_for_when_its_search_will_be_over() -> None:
+    """Of which plans to stand, that take a tenth of the time, say nothing."""
+    it = planner(3)
+    waiting, asked, landed = situation(asked=-1), situation(), situation(mode=HAND)
+    assert [it.ahead(state) for state in (waiting, asked, landed)] == [4, CFG.plan.longest, 4]
+    it.seconds[True].extend([0.5, 0.3])
+    assert [it.ahead(state) for state in (waiting, asked, landed)] == [4, 1 + 23, 4]  # 0.46 s
 
 
 def test_before_it_is_asked_for_the_foot_stand_goes_on() -> None:

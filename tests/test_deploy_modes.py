@@ -180,6 +180,26 @@ def test_a_plan_from_another_mode_than_the_one_that_runs_is_stale():
     assert it.counts["stale"] == 1
 
 
+def test_plans_that_come_faster_than_they_begin_all_run():
+    it = performer()
+    for k in range(12):
+        it.offer(made(k, k + 4, "f" * 8))
+        play(it, k, k + 1)
+        assert it.plan is None or it.plan.begin == k
+    assert it.counts == {"taken": 8}
+
+
+def test_a_newer_plan_takes_the_place_of_those_that_begin_with_it_or_later():
+    it = performer()
+    play(it, 0, 1)
+    it.offer(made(1, 3, "fffff"))
+    it.offer(made(2, 5, "jjjhh"))
+    it.offer(made(3, 5, "ffjhh"))
+    it.offer(made(4, 4, "fjhhh"))
+    assert play(it, 1, 8)[0] == "ff" + "f" + "fjhh"
+    assert it.counts == {"taken": 2}
+
+
 def test_an_old_plan_starts_nothing_and_a_stance_goes_on():
     it = performer()
     it.offer(made(1, 0, "f" * 12 + "jjhh", running=NONE))

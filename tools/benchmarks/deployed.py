@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ from deploy.process import ROOT, Job
 from deploy.settings import DeployCfg
 from deploy.slots import STATE
 from hmc.cfg import load
-from hmc.go2.model import DT
 from hmc.go2.stances import FOOTSTAND, HANDSTAND
 from hmc.sim.mujoco import MujocoSim
 from tools.benchmarks.figures import Common, Figures
@@ -53,7 +51,6 @@ def deployed(args: Deployed) -> Figures:
     figures.add("tick_us", 1e6 * np.median(spent[ticked]), "a state frame with one, without a policy [us]")
 
     planner = planner_of(Job(seed=args.seed, threads=1, task_set=args.set))
-    planner.seconds = deque([AHEAD * DT])
     planner.warm()
     stand = {"mode": FOOT, "asked": -1}
     kinds = {
