@@ -13,7 +13,7 @@ from deploy.estimate import Estimate
 from deploy.estimator import Estimator
 from deploy.modes import NAMES, NONE, Performer
 from deploy.observe import vertical
-from deploy.remote import unpack
+from deploy.remote import ABSENT, unpack
 from deploy.safety import EMERGENCY, Body, Envelope, Inputs, Machine, Phase, limited
 from deploy.settings import DeployCfg, EnvelopeCfg, RampCfg
 from deploy.slots import STATE
@@ -135,7 +135,9 @@ class Control:
         phase = self.phase  # what a phase does not ask for is not looked at: this is done 500 times a second
         posed = phase in (Phase.LIE, Phase.STAND, Phase.READY) and self._posed()
         settled = phase == Phase.STAND and self._settled()
-        self._step(Inputs(unpack(state.remote).buttons, fault, posed, settled, self.planner))
+        # what is held while the remote cannot be heard is not let go, nor pressed anew after that
+        buttons = None if state.remote == ABSENT else unpack(state.remote).buttons
+        self._step(Inputs(buttons, fault, posed, settled, self.planner))
 
     def idle(self, now: float) -> None:
         """No frame came that is believed."""

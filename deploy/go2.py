@@ -25,7 +25,7 @@ from deploy.dds import LOOPBACK, ROBOT_DOMAIN, SIMULATION_DOMAIN  # noqa: E402
 from deploy.log import pipe  # noqa: E402
 from deploy.loop import policies  # noqa: E402
 from deploy.memory import Memory  # noqa: E402
-from deploy.process import ENVIRONMENT, Job, allowed, share_cores, spawn  # noqa: E402
+from deploy.process import ENVIRONMENT, Ended, Job, allowed, end, ready, share_cores, spawn  # noqa: E402
 from deploy.safety import Phase  # noqa: E402
 from deploy.settings import DeployCfg  # noqa: E402
 from deploy.slots import Board  # noqa: E402
@@ -36,7 +36,6 @@ from hmc.cfg import load  # noqa: E402
 from hmc.cli import command_line, one_line_errors  # noqa: E402
 
 LOOK = 0.05  # s
-START_UP = 60.0  # s for a process to be ready
 # what ends a run: a lost terminal, too
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
@@ -127,12 +126,14 @@ class Args:
         )
 
 
-class Ended(RuntimeError):
-    """A process ended that should not have; its exit status."""
-
-    def __init__(self, name: str, status: int):
-        super().__init__(f"{name} ended with status {status}")
-        self.status = status
+@contextlib.contextmanager
+def once() -> Iterator[None]:
+    """What ends a run does so once: a key that is pressed again after this cuts nothing of its end short."""
+    try:
+        yield
+    finally:
+        for number in ENDING:
+            signal.signal(number, signal.SIG_IGN)
 
 
 @contextlib.contextmanager
@@ -155,6 +156,7 @@ def reserved(folder: Path) -> Iterator[None]:
 
     Raises:
         ValueError: another run writes there.
+        OSError: this one cannot.
     """
     folder.mkdir(parents=True, exist_ok=True)
     held = os.open(folder, os.O_RDONLY)
@@ -163,8 +165,9 @@ def reserved(folder: Path) -> Iterator[None]:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ValueError(f"another run writes to {folder}: end it, or take another --out") from None
-        for name in ("run.mcap", "truth.npz", "summary.json"):
+        for name in ("run.mcap", "truth.npz", "truth.part.npz", "summary.json"):
             (folder / name).unlink(missing_ok=True)
+        (folder / "run.mcap").touch()  # what cannot be written there is said before the robot moves
         yield
     finally:
         os.close(held)
@@ -180,48 +183,25 @@ def stand_in(args: Args, domain: int) -> Iterator[tuple[Port, subprocess.Popen[s
         command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
-        port = re.search(r"orders at UDP port (\d+)", _ready(process, "the stand-in"))
+        port = re.search(r"orders at UDP port (\d+)", ready(process, "the stand-in"))
         assert port
         orders = Port(int(port[1]))
         yield orders, process
         orders.close()
     finally:
-        _end(process)
-
-
-def _ready(process: subprocess.Popen[str], name: str) -> str:
-    """The line in which a process says that it is ready."""
-    assert process.stdout is not None
-    line = process.stdout.readline()
-    if not line.startswith("ready"):
-        raise Ended(name, process.wait())
-    return line
-
-
-def _end(process: subprocess.Popen[str], wait: float = 10.0) -> None:
-    process.terminate()
-    try:
-        process.wait(wait)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+        end(process)
 
 
 def _end_all(processes: list[subprocess.Popen[str]]) -> None:
     for process in processes:
-        _end(process)
+        end(process)
 
 
 def _stay_damped(board: Board) -> None:
-    """Give the watchdog its time, if anything was commanded; no Ctrl-C cuts it short."""
+    """Give the watchdog its time, if anything was commanded."""
     heart = board.heart.read()
     if heart is not None and heart["commanding"]:
-        before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING}
         time.sleep(DAMPED)
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def run(
@@ -242,10 +222,10 @@ def run(
         port: of the stand-in.
         robot: the stand-in.
     """
-    board, (source, end) = Board(), pipe()
-    sink = os.fdopen(end, "wb", buffering=0)  # may be closed twice
+    board, (source, drain) = Board(), pipe()
+    sink = os.fdopen(drain, "wb", buffering=0)  # may be closed twice
     base = {**vars(args.job()), "board": board.descriptor}
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack, once():
         stack.callback(board.close)
         stack.callback(os.sched_setaffinity, 0, os.sched_getaffinity(0))
         base["core"], others = share_cores()
@@ -260,17 +240,17 @@ def run(
             stack.callback(_end_all, watch)
             stack.callback(_stay_damped, board)
             planner = spawn("planner", Job(**base), [board.descriptor], **pipes)
-            stack.callback(_end, planner)
+            stack.callback(end, planner)
         if robot is None:  # before its own controller is stopped, what is wrong with the settings is said
-            _ready(planner, "the planner")
+            ready(planner, "the planner")
         with undisturbed():
             if args.awake and base["core"] is not None and args.real_time and allowed():
-                stack.callback(_end, spawn("awake", Job(**base), []))
+                stack.callback(end, spawn("awake", Job(**base), []))
             job = Job(**{**base, "log": sink.fileno()})
             control = spawn("loop", job, [board.descriptor, sink.fileno()], **pipes)
-            stack.callback(_end, control)  # before all others, whose end takes its time
+            stack.callback(end, control)  # before all others, whose end takes its time
             sink.close()
-        console.print(f"control process: {_ready(control, 'the control process').strip()}", highlight=False)
+        console.print(f"control process: {ready(control, 'the control process').strip()}", highlight=False)
         if not args.dry_run:
             with undisturbed():
                 watch.append(spawn("watchdog", Job(**{**base, "pid": control.pid}), [board.descriptor]))
@@ -285,7 +265,7 @@ def run(
             pids["watchdog"] = watch[0].pid
         memory.begin(pids)
         with View(console) as view:
-            follow(board, (control, robot or control), planner, operator, view, memory)
+            follow(board, (control, robot or control), planner, watch, operator, view, memory)
         heart = board.heart.read()
         if operator is None and heart is not None and heart["commanding"]:
             console.print("the control process has ended, the watchdog damps the robot: Ctrl-C ends it")
@@ -296,6 +276,7 @@ def follow(
     board: Board,
     needed: Sequence[subprocess.Popen[str]],
     planner: subprocess.Popen[str],
+    watch: Sequence[subprocess.Popen[str]],
     operator: Presser | None,
     view: View,
     memory: Memory,
@@ -303,7 +284,7 @@ def follow(
     """Show the status until a process that is needed ends, or the operator in simulation has seen enough.
 
     Raises:
-        Ended: the planner could not start. A robot that moves already is left to its operator.
+        Ended: planner or watchdog could not start. A robot that moves already is left to its operator.
     """
     phase = Phase.PASSIVE
     while all(process.poll() is None for process in needed):
@@ -317,6 +298,9 @@ def follow(
         waits = phase == Phase.PASSIVE if operator is None else phase < Phase.HYBRID
         if waits and planner.poll():
             raise Ended("the planner", planner.returncode)
+        for watchdog in watch:
+            if phase == Phase.PASSIVE and watchdog.poll() is not None:
+                raise Ended("the watchdog", watchdog.returncode)
         if operator is not None and operator.see(status):
             return
 
@@ -359,9 +343,12 @@ def perform(args: Args) -> int:
             else:
                 run(args, console, memory)
     except Ended as ended:
-        if ended.status < 0:  # else the process has said itself what was wrong
-            print(f"error: {ended}: a signal, or no memory was left", file=sys.stderr)
+        if ended.status != 2:  # else the process has said itself what was wrong
+            print(f"error: {ended}", file=sys.stderr)
         return 2 if ended.status == 2 else 1
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     lost = robot is not None and robot.returncode != 0
     if robot is not None and lost:
         print(f"error: the stand-in ended with status {robot.returncode} in the middle", file=sys.stderr)
@@ -374,8 +361,8 @@ def perform(args: Args) -> int:
             "memory_mb": memory.found,
             "stolen": share if (share := stolen.share) is None else round(share, 4),
         }
-    write(args.out / "summary.json", summary)
-    console.print_json(data=summary)
+        console.print_json(data=summary)
+        write(args.out / "summary.json", summary)
     reached = summary["stages_true"] if args.simulated else summary["stages"]
     return 0 if reached and reached["success"] and not lost else 1
 

@@ -18,6 +18,7 @@ import fcntl
 import json
 import os
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -215,12 +216,20 @@ def about(job: Job) -> dict[str, str]:
     return {"domain": str(job.domain), "interface": job.interface, "settings": settings}
 
 
-def main(job: Job) -> None:
-    """Be the log's process until the control process has ended; SIGTERM is not needed and does nothing."""
+def main(job: Job) -> int:
+    """Be the log's process until the control process has ended; SIGTERM is not needed and does nothing.
+
+    Exit status 2 and one line where it cannot write on: then the control process counts what is not logged.
+    """
     until_told()
-    with os.fdopen(job.log, "rb") as source:
-        write(source, Path(job.path), about(job))
+    try:
+        with os.fdopen(job.log, "rb") as source:
+            write(source, Path(job.path), about(job))
+    except OSError as error:
+        print(f"log: nothing more is written: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":
-    main(told())
+    sys.exit(main(told()))

@@ -11,6 +11,7 @@ import numpy as np
 
 from deploy.observe import anchor_of
 from deploy.settings import PlanCfg
+from deploy.slots import STEPS
 from deploy.so3 import Array
 from hmc.go2.network import Network, follow
 
@@ -45,15 +46,18 @@ class Plan:
         """The plan in a slot's value.
 
         Raises:
-            ValueError: it holds modes that are none, or targets that are not numbers.
+            ValueError: it holds modes or steps that are none, or targets that are not numbers.
         """
-        steps = int(record["steps"])
+        number, base, begin, running, steps = (
+            int(record[name]) for name in ("number", "base", "begin", "running", "steps")
+        )
+        if not (0 < steps <= STEPS and 0 <= base <= begin):
+            raise ValueError(f"plan {number} has {steps} steps from tick {begin} on, made at tick {base}")
         modes, u = tuple(record["modes"][:steps].tolist()), record["u"][:steps].astype(np.float64)
-        if not modes or not all(0 <= mode < len(NAMES) for mode in modes):
-            raise ValueError(f"plan {record['number']} has {steps} steps of modes {sorted(set(modes))}")
+        if not all(0 <= mode < len(NAMES) for mode in modes):
+            raise ValueError(f"plan {number} has {steps} steps of modes {sorted(set(modes))}")
         if not np.isfinite(u).all():
-            raise ValueError(f"plan {record['number']} has targets that are not numbers")
-        number, base, begin, running = (int(record[name]) for name in ("number", "base", "begin", "running"))
+            raise ValueError(f"plan {number} has targets that are not numbers")
         return cls(number, base, begin, running, modes, u)
 
 
@@ -117,10 +121,11 @@ class Performer:
         if not ripe:
             return
         self._coming, plan = self._coming[len(ripe) :], ripe[-1]
-        before = [self._ran.get(tick, NONE) for tick in range(plan.begin - 1, k)]
-        if k - plan.begin >= self.cfg.expires:
+        if k - plan.begin >= self.cfg.expires:  # nor is what ran since worth a look, however much that is
             self.counts["late"] += 1
-        elif before != [plan.running, *plan.modes[: k - plan.begin]]:
+            return
+        before = [self._ran.get(tick, NONE) for tick in range(plan.begin - 1, k)]
+        if before != [plan.running, *plan.modes[: k - plan.begin]]:
             self.counts["stale"] += 1
         else:
             self.counts["taken"] += 1

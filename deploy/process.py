@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -17,6 +18,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 _PATHS = ("cfg", "path", "foot", "hand", "task")  # of a job
+START_UP = 120.0  # s for a process to be ready
 _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # of mlockall(2)
 # matrices of 30 rows only lose by threads, which wait for each other in loops that fill a core
@@ -87,6 +89,45 @@ def spawn(module: str, job: Job, descriptors: Sequence[int], **streams: Any) -> 
     return subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, pass_fds=descriptors, text=True, start_new_session=True, **streams
     )
+
+
+class Ended(RuntimeError):
+    """A process ended that should not have; its exit status."""
+
+    def __init__(self, name: str, status: int):
+        why = f": a signal, no answer for {START_UP:g} s, or no memory was left" if status < 0 else ""
+        super().__init__(f"{name} ended with status {status}{why}")
+        self.status = status
+
+
+def ready(process: subprocess.Popen[str], name: str) -> str:
+    """The line in which a process says that it is ready; whatever it says before is not that.
+
+    Raises:
+        Ended: it ended before, or was ended as it took too long.
+    """
+    assert process.stdout is not None
+    patience = threading.Timer(START_UP, process.kill)
+    patience.start()
+    try:
+        for line in process.stdout:
+            if line.startswith("ready"):
+                return line
+    finally:
+        patience.cancel()
+    raise Ended(name, process.wait())
+
+
+def end(process: subprocess.Popen[str], wait: float = 10.0) -> None:
+    """Tell a process to end, and see that it does within so long [s]."""
+    process.terminate()
+    try:
+        process.wait(wait)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
 
 
 def told() -> Job:

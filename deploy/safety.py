@@ -52,7 +52,7 @@ class Inputs:
     """What the state machine decides by.
 
     Attributes:
-        buttons: pressed on the remote; None: unknown, as no frame came that is believed.
+        buttons: pressed on the remote; None: unknown, as no frame is believed, or no remote near.
         fault: what is wrong; "" for nothing.
         posed: whether the phase's slow motion has come to its end, and the joints with it.
         settled: whether the estimator knows the state.

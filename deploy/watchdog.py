@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,7 +16,7 @@ from contextlib import suppress
 import numpy as np
 
 from deploy.codec import FOC, JOINTS, MotorCommand, encode_command
-from deploy.dds import Link, Publisher
+from deploy.dds import Link, LinkError, Publisher
 from deploy.messages import LowCmd_
 from deploy.process import Job, real_time, told, until_told
 from deploy.settings import DeployCfg, WatchdogCfg
@@ -147,18 +148,23 @@ def watch(
     it.close()
 
 
-def main(job: Job) -> None:
-    """Be the watchdog until SIGTERM, see `watch`."""
+def main(job: Job) -> int:
+    """Be the watchdog until SIGTERM, see `watch`; exit status 2 and one line if it cannot reach the robot."""
     stopped = until_told()
     cfg = load(job.cfg, DeployCfg, job.set)
     watchdog = Watchdog(Board(job.board), cfg.watchdog)
-    publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
+    try:
+        publisher = Link(job.domain, job.interface).publisher("rt/lowcmd", LowCmd_)
+    except LinkError as error:
+        print(f"watchdog: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
     if job.core is not None:  # nor does it wait for a planner where the control process leaves its core alone
         os.sched_setaffinity(0, {*os.sched_getaffinity(0), job.core})
     real_time(PRIORITY, job.real_time)  # now only: making a link takes 70 ms of a core
     period, after = cfg.watchdog.period, cfg.watchdog.after
     watch(watchdog, job.pid, publisher, damping(cfg.output.damping), period, stopped, after, job.parent)
+    return 0
 
 
 if __name__ == "__main__":
-    main(told())
+    sys.exit(main(told()))

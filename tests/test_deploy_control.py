@@ -16,7 +16,7 @@ from deploy.control import TICK, Control, uncertainty
 from deploy.ekf import N, V
 from deploy.estimate import Estimate
 from deploy.loop import policies
-from deploy.remote import Button, Remote, pack
+from deploy.remote import ABSENT, Button, Remote, pack
 from deploy.safety import PEAK_TORQUE, Phase
 from deploy.settings import DeployCfg
 from hmc.cfg import load
@@ -228,6 +228,18 @@ def test_single_bad_frames_disturb_nothing():
     assert all(rig.held[-100:])
     counts = rig.control.checks.counts
     assert min(counts[name] for name in ("checksum", "not a number", "repeated", "out of order", "gap")) > 0
+
+
+def test_a_button_held_while_the_remote_is_gone_is_one_press(met: Met):
+    """START goes on to the foot stand; a moment without the remote would ask for the handstand as well."""
+    control, frames = duplicate(met[Phase.READY][0]), met[Phase.READY][1]
+    now, held = control.checks.heard, pack(Remote(Button.START))
+    for i, frame in enumerate(frames[:60]):
+        now += 0.002
+        remote = ABSENT if 20 <= i < 24 else held
+        control.hear(encode_state(decode_state(frame)._replace(remote=remote)), now)
+    assert control.phase == Phase.HYBRID, control.machine.reason
+    assert not control.machine.asked
 
 
 def test_an_unknown_heading_is_no_unknown_velocity():

@@ -206,6 +206,23 @@ def test_an_old_plan_starts_nothing_and_a_stance_goes_on():
     assert play(it, 0, 40)[0] == "f" * 40  # at step 10 it has expired
 
 
+def test_a_plan_of_long_ago_takes_no_time():
+    """What ran since its begin would be millions of ticks to look through."""
+    it, looked = performer(), list[int]()
+
+    class Ran(dict[int, int]):
+        def get(self, key, default=None):
+            looked.append(key)
+            return super().get(key, default)
+
+    it._ran = Ran()
+    play(it, 0, 1)
+    it.offer(made(1, 0, "fff", running=NONE))
+    it.take_over(10_000)
+    assert it.counts["late"] == 1
+    assert len(looked) <= RULES.expires
+
+
 def test_a_jump_is_finished_whatever_happens_to_the_planner():
     it = performer()
     it.offer(made(1, 0, "f" * 8 + "j" * 5 + "h" * 3, running=NONE))
@@ -246,3 +263,10 @@ def test_a_plan_that_is_none_is_refused():
     record["modes"][:2], record["u"][1, 3] = (0, 1), np.nan
     with pytest.raises(ValueError, match="not numbers"):
         Plan.read(record)
+    record["u"][1, 3] = 0.0
+    assert Plan.read(record).modes == (0, 1)
+    for name, value in (("steps", -5), ("steps", 129), ("begin", -(2**62)), ("base", -(2**63)), ("base", 1)):
+        wrong = record.copy()
+        wrong[name] = value
+        with pytest.raises(ValueError, match="steps from tick"):
+            Plan.read(wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 from typing import Any, cast
+from unittest import mock
 
 import pytest
 
@@ -18,9 +20,12 @@ from deploy import go2
 from deploy.buttons import Port
 from deploy.codec import encode_state
 from deploy.dds import Link, Subscriber
+from deploy.log import STATE, Recorder, pipe
 from deploy.loop import Refusal, preflight
+from deploy.process import Ended, Job, end, ready, spawn
 from deploy.safety import Phase
 from deploy.settings import DeployCfg
+from deploy.slots import Board
 from tests import wire
 from tests.test_deploy_control import Met, met
 from tests.test_deploy_loop import Turns
@@ -95,7 +100,7 @@ def test_a_folder_is_one_run_s(tmp_path):
             go2.reserved(folder).__enter__()
         assert (folder / "run.mcap").read_bytes() == b"mine"
     with go2.reserved(folder):
-        assert not (folder / "run.mcap").exists()
+        assert (folder / "run.mcap").read_bytes() == b""
 
 
 def test_a_signal_waits_until_what_is_started_is_known():
@@ -112,6 +117,85 @@ def test_a_signal_waits_until_what_is_started_is_known():
             start(number)
     assert known == list(go2.ENDING)
     assert {number: signal.getsignal(number) for number in go2.ENDING} == before
+
+
+def test_a_key_that_is_pressed_again_cuts_no_end_short():
+    with contextlib.ExitStack() as stack:
+        for number in go2.ENDING:
+            stack.callback(signal.signal, number, signal.getsignal(number))
+        with pytest.raises(KeyboardInterrupt), go2.once():
+            os.kill(os.getpid(), signal.SIGINT)
+        for number in go2.ENDING:
+            os.kill(os.getpid(), number)
+
+
+def speaking(code: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+
+
+def test_who_is_not_ready_in_time_is_ended(monkeypatch):
+    """A library may say something first; who says nothing, or ends, is named."""
+    with speaking(
+        "print('a banner'); print('ready: so', flush=True); import time; time.sleep(60)"
+    ) as process:
+        assert ready(process, "it") == "ready: so\n"
+        end(process)
+    with (
+        speaking("import sys; print('ended'); sys.exit(3)") as process,
+        pytest.raises(Ended, match=r"it ended with status 3$"),
+    ):
+        ready(process, "it")
+    monkeypatch.setattr("deploy.process.START_UP", 0.5)
+    with (
+        speaking("print('a banner', flush=True); import time; time.sleep(60)") as process,
+        pytest.raises(Ended, match=r"it ended with status -9: a signal, no answer for 0.5 s"),
+    ):
+        ready(process, "it")
+
+
+def test_a_watchdog_that_cannot_start_ends_the_program():
+    """Nothing is ever commanded without it: who waits for that waits for ever."""
+    board, mocked = Board(), cast(Any, mock.Mock())
+    board.status.write(board.status.blank())
+    process = spawn("watchdog", Job(board=board.descriptor, interface="none0"), [board.descriptor])
+    with speaking("import time; time.sleep(60)") as other:
+        with pytest.raises(Ended, match="the watchdog") as ended:
+            go2.follow(board, [other], other, [process], None, mocked, mocked)
+        other.kill()
+    assert ended.value.status == 2
+    board.close()
+
+
+def test_what_the_system_refuses_is_one_line(monkeypatch, capsys):
+    """No process, no memory: nothing was started, or all of it has been ended."""
+    monkeypatch.setattr(go2, "ENDING", ())
+    monkeypatch.setattr(go2, "run", mock.Mock(side_effect=BlockingIOError(11, "no more processes")))
+    assert go2.perform(go2.Args(interface="eth7")) == 2
+    assert capsys.readouterr().err == "error: [Errno 11] no more processes\n"
+
+
+def test_a_summary_is_shown_where_it_cannot_be_written(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(go2, "ENDING", ())
+    monkeypatch.setattr(go2, "run", lambda *_: None)
+    monkeypatch.setattr("deploy.summary.summarise", lambda *_: {"stages": None})
+    with pytest.raises(SystemExit, match="2"):
+        go2.perform(go2.Args(interface="eth7", out=tmp_path / "none"))
+    told = capsys.readouterr()
+    assert '"stages": null' in told.out
+    assert told.err.count("\n") == 1
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is full")
+def test_a_log_on_a_full_disk_says_so_in_one_line():
+    source, sink = pipe()
+    process = spawn("log", Job(log=source, path="/dev/full"), [source], stderr=subprocess.PIPE)
+    os.close(source)
+    recorder = Recorder(sink)
+    recorder.add(STATE, bytes(1180))
+    os.close(sink)
+    _, wrong = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert wrong == "log: nothing more is written: [Errno 28] No space left on device\n"
 
 
 def test_nobody_hears_a_button_once_the_stand_in_is_gone():
@@ -136,9 +220,6 @@ def test_a_process_ends_with_the_one_that_started_it(parent, told):
 @pytest.mark.parametrize(("asked", "status"), [({}, 0), ({"search": ("search.samples=0",)}, 2)])
 def test_the_planner_says_what_is_wrong_before_it_says_that_it_is_ready(asked: dict[str, Any], status):
     """Who releases a robot from its own controller waits for that."""
-    from deploy.process import Job, spawn
-    from deploy.slots import Board
-
     board = Board()
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     process = spawn("planner", Job(board=board.descriptor, **asked), [board.descriptor], **pipes)

@@ -255,3 +255,23 @@ def test_a_long_log_leaves_the_garbage_collector_nothing_to_walk_over(tmp_path: 
         for name in Truth._fields:
             assert len(found[name]) == Log.BLOCK + 10
             assert np.array_equal(found[name][-2:], [getattr(truth, name) for truth in kept])
+
+
+def test_a_truth_that_cannot_be_written_whole_is_not_there(tmp_path, monkeypatch):
+    """Half a file is none that a summary can read."""
+    path, whole = tmp_path / "truth.npz", np.savez
+    log = Log(path)
+    log.add(StandIn(ideal()).truth(), 0.0)
+
+    def full(part: Path, **columns: Any) -> None:
+        whole(part, **columns)
+        part.write_bytes(part.read_bytes()[:100])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="No space left"):
+        log.write()
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(np, "savez", whole)
+    log.write()
+    assert [found.name for found in tmp_path.iterdir()] == ["truth.npz"]

@@ -108,7 +108,13 @@ class Log:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             steps = np.concatenate(self._blocks)[: self._steps]
             columns: dict[str, Any] = {name: steps[name] for name in TRUTH.names or ()}
-            np.savez(self._path, **columns)  # compressed, half an hour takes longer than anybody waits for it
+            stem = self._path.name.removesuffix(".npz")
+            part = self._path.with_name(f"{stem}.part.npz")  # until it is whole
+            try:
+                np.savez(part, **columns)  # compressed, half an hour takes longer than anybody waits for it
+                part.replace(self._path.with_name(f"{stem}.npz"))
+            finally:
+                part.unlink(missing_ok=True)
 
 
 def run(args: Args, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
