@@ -21,6 +21,7 @@ from deploy.safety import Phase
 PRESS, PAUSE = 0.15, 0.6  # s that a button is held, and that follow before the next press
 HOLD = 2.5  # s of the foot stand before the handstand is asked for
 STAND = 4.5  # s of the handstand, then the run is over
+RISEN = 120.0  # s until the foot stand: what keeps a robot from it for longer does so for good
 LONGEST = 40.0  # s after asking: the planner takes its time on a busy machine
 _UP = 60.0  # deg of pitch that count as upright
 
@@ -81,7 +82,7 @@ class Operator:
     def see(self, status: np.ndarray) -> bool:
         """Act on the newest status; whether the run is over."""
         now, phase = 0.02 * int(status["k"]), Phase(int(status["phase"]))
-        if phase == Phase.DAMPING:
+        if phase == Phase.DAMPING or (phase < Phase.HYBRID and now > RISEN):
             return True
         if self._pressed and now >= self._next:
             self._port.press()

@@ -212,7 +212,14 @@ class Link:
 
 def _follow(reader: BuiltinDataReader, known: dict[Any, Any], most: int) -> None:
     """Take down what has come to a domain and what has left it since the last call."""
-    for it in reader.take(most):
+    for _ in range(most):
+        try:
+            news = reader.take(1)
+        except UnicodeDecodeError:  # of a name that is no UTF-8: who has it stays nameless, others do not
+            continue
+        if not news:
+            return
+        (it,) = news
         if it.sample_info.instance_state == InstanceState.Alive:
             known[it.key] = it
         else:

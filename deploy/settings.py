@@ -19,6 +19,7 @@ _TIME = 0.001, 3600.0  # s
 _MAYBE = 0.0, 3600.0  # s, of what may be left out
 _READING = 0.0, 1000.0  # of any sensor
 _KP, _KD = (0.0, 200.0), (0.0, 20.0)  # N m/rad, N m s/rad: several times what stands it up
+_DAMPING = 1.0, 20.0  # N m s/rad: with less the legs are as good as limp
 _STEP = 0.001, 2 * math.pi  # rad, at most more than a joint has
 _TURN = -2 * math.pi, 2 * math.pi  # rad
 _KINDS = ("hip", "thigh", "calf")
@@ -191,7 +192,7 @@ class OutputCfg:
 
     def __post_init__(self) -> None:
         _check(self, _STEP, "step")
-        _check(self, _KD, "damping")
+        _check(self, _DAMPING, "damping")
 
 
 @dataclass(frozen=True)

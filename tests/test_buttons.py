@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy.buttons import HOLD, PAUSE, PRESS, STAND, Keyboard, Operator, Port
+from deploy.buttons import HOLD, PAUSE, PRESS, RISEN, STAND, Keyboard, Operator, Port
 from deploy.safety import Phase
 from deploy.slots import STATUS
 
@@ -105,3 +105,11 @@ def test_the_operator_goes_all_the_way(desk):
     assert not it.see(status(8.0 + STAND - 0.1, pitch=85))
     assert it.see(status(8.0 + STAND, pitch=85))
     assert it.see(status(9.0, Phase.DAMPING))
+
+
+@pytest.mark.parametrize("phase", [Phase.PASSIVE, Phase.LIE, Phase.STAND, Phase.READY])
+def test_the_operator_gives_up_a_robot_that_does_not_get_on(desk, phase):
+    """A fault keeps it passive, or its planner hangs: START would be pressed for ever."""
+    assert not Operator(desk.port).see(status(RISEN, phase))
+    assert Operator(desk.port).see(status(RISEN + 0.02, phase))
+    assert not Operator(desk.port, hold=1800.0).see(status(RISEN + 0.02, pitch=-90.0))

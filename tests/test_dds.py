@@ -113,6 +113,22 @@ def wait(link: Link, count: int = 1) -> list[str]:
     return rivals
 
 
+def test_a_program_whose_name_is_no_text_is_another_like_any() -> None:
+    """Its name is what it was started by, in whatever encoding; to read it ended the control process."""
+    code = (
+        f"import sys, time; sys.path[:0] = {[str(PEERS.parents[1]), *sys.path]!r}\n"
+        "from deploy.dds import Link; from deploy.messages import LowCmd_\n"
+        f"publisher = Link({OTHER}).publisher('rt/lowcmd', LowCmd_); time.sleep(20)"
+    )
+    link, python = Link(OTHER), os.path.realpath(sys.executable)
+    with subprocess.Popen([b"\xff\xfe", b"-c", code.encode()], executable=python) as process:
+        until, found = time.monotonic() + 10.0, list[str]()
+        while not found and time.monotonic() < until:
+            found = wait(link)
+        process.kill()
+    assert [name.split()[0] for name in found] == ["participant"]
+
+
 def test_a_reader_keeps_what_it_has_not_taken() -> None:
     """The newest frames up to its depth: a stall of the reader costs none of the last ones."""
     link = Link(DOMAIN)

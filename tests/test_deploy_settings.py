@@ -11,8 +11,9 @@ from hmc.cfg import CfgError, load
 
 FILE = Path("cfg/deploy.toml")
 REFUSED = {
-    "output.damping=-5": "output: damping must be 0 to 20, got -5",
-    "output.damping=500": "output: damping must be 0 to 20, got 500",
+    "output.damping=-5": "output: damping must be 1 to 20, got -5",
+    "output.damping=0": "output: damping must be 1 to 20, got 0",
+    "output.damping=500": "output: damping must be 1 to 20, got 500",
     "output.step=0": "output: step must be 0.001 to ",
     "lie.kp=-30": "lie: kp must be 0 to 200, got -30",
     "stand.kp=201": "stand: kp must be 0 to 200, got 201",

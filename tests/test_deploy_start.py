@@ -20,7 +20,7 @@ from deploy import go2
 from deploy.buttons import Port
 from deploy.codec import encode_state
 from deploy.dds import Link, Subscriber
-from deploy.log import STATE, Recorder, pipe
+from deploy.log import STATE, Recorder, pipe, read, write
 from deploy.loop import Refusal, preflight
 from deploy.process import Ended, Job, end, ready, spawn
 from deploy.safety import Phase
@@ -183,6 +183,19 @@ def test_a_summary_is_shown_where_it_cannot_be_written(monkeypatch, capsys, tmp_
     told = capsys.readouterr()
     assert '"stages": null' in told.out
     assert told.err.count("\n") == 1
+
+
+def test_an_event_that_is_too_long_costs_no_other(tmp_path):
+    """A name that another program gives itself may be of any length."""
+    source, sink = pipe()
+    recorder = Recorder(sink)
+    for reason in ("first", 5000 * "x", "last"):
+        recorder.event("phase", reason=reason)
+    os.close(sink)
+    with os.fdopen(source, "rb") as stream:
+        write(stream, tmp_path / "run.mcap", {})
+    assert [event["reason"] for _, _, event in read(tmp_path / "run.mcap")] == ["first", "last"]
+    assert recorder.lost == 1
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is full")
