@@ -16,7 +16,7 @@ from hmc.running import Running
 from hmc.sampling import METHODS, SamplingCfg
 from tests.linear import Linear
 from tests.test_sampling import mode, situations
-from tests.toy import Push, Ramp, toy_task
+from tests.toy import COST, Push, Ramp, toy_task
 
 X = [0.3, 0.0]
 
@@ -132,3 +132,33 @@ def test_a_mode_that_fails_as_it_is_entered_changes_nothing():
         running.act(1, x, u, 5)
     assert (running.mode, running.ran, running.memory, running.u) == before
     assert running.ran == 5
+
+
+@pytest.mark.parametrize("cheap", [False, True])
+def test_a_cost_in_one_call_may_keep_what_it_gives(cheap):
+    """One that computes into a buffer of its own, and one that is always the same."""
+    buffer, ones = torch.empty(1000, 3, dtype=torch.float64), torch.ones(1000, 1, dtype=torch.float64)
+
+    def buffered(x: Tensor, *rest: Tensor) -> Tensor:
+        buffer[: len(x)] = torch.stack([term(x, *rest) for term in COST.stage.values()], 1)
+        return buffer[: len(x)]
+
+    time = Cost({"time": lambda x, u, u_prev, k: ones[: len(x), 0]}, nonnegative=True)
+    for cost, at_once in ((COST, buffered), (time, lambda x, *rest: ones[: len(x)])):
+        wanted = plan(toy_task(5, cost=cost, cheap=cheap), [1.5, 1.0], samples=4)
+        task = toy_task(5, cost=replace(cost, on_cpu=at_once), cheap=cheap)
+        found = plan(task, [1.5, 1.0], samples=4)
+        assert found == wanted
+        assert found.known.cost == wanted.known.cost
+    assert bool((ones == 1).all())
+
+
+@pytest.mark.parametrize(("dtype", "wall"), [(torch.float32, 1e20), (torch.float64, 1e200)])
+def test_a_sample_that_costs_too_much_to_be_squared_has_no_say(dtype, wall):
+    cfg = SamplingCfg(samples=3, temperature=0.5)
+    noise = torch.tensor([0.0, 1.0, 50.0], dtype=dtype)[None, :, None, None]
+    moved, inf = (
+        METHODS["mppi"](cfg, noise, torch.tensor([[1.0, 0.5, high]], dtype=dtype))[0]
+        for high in (wall, math.inf)
+    )
+    assert torch.equal(moved, inf)
