@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from hmc import Cost, Mode, ModeSet, Rules, make_start, plan
+from hmc import Cost, Ensemble, Mode, ModeSet, Rules, make_start, plan
 from hmc.go2.task import JumpCfg
 from hmc.running import Running
 from hmc.sampling import METHODS, SamplingCfg
 from tests.linear import Linear
 from tests.test_sampling import mode, situations
-from tests.toy import COST, Push, Ramp, toy_task
+from tests.toy import COST, Push, Ramp, ToySim, toy_task
 
 X = [0.3, 0.0]
 
@@ -132,6 +132,54 @@ def test_a_mode_that_fails_as_it_is_entered_changes_nothing():
         running.act(1, x, u, 5)
     assert (running.mode, running.ran, running.memory, running.u) == before
     assert running.ran == 5
+
+
+@pytest.mark.parametrize(
+    ("gives", "words"),
+    [
+        (lambda u, memory: None, r"act\(\) gives \(actions, memory\), got a NoneType"),
+        (lambda u, memory: u[:1].repeat(2, 1), r"act\(\) gives \(actions, memory\), got a Tensor"),
+        (lambda u, memory: (0.5, memory), r"act\(\) actions are 0.5, expected a tensor of shape \(\d+, 1\)"),
+        (lambda u, memory: (u, None), r"act\(\) memory are None, expected a tensor of shape \(\d+, 1\)"),
+    ],
+)
+def test_a_mode_that_gives_something_else_is_named(gives, words):
+    class Slips(Mode):
+        name, memory_size = "slips", 1
+
+        def act(self, x, u, memory, k):
+            return gives(u, memory)
+
+    with pytest.raises(ValueError, match=f"mode 'slips': {words}"):
+        plan(toy_task(4, [Slips()]), X)
+
+
+@pytest.mark.parametrize("which", ["lower_bound", "tail_bound"])
+@pytest.mark.parametrize(
+    ("bound", "got"), [(lambda x: torch.full((len(x), 1), 0.1), r"\(\d+, 1\)"), (lambda x: 0.1, "0.1")]
+)
+def test_a_bound_of_another_shape_is_named(which, bound, got):
+    bounds = {"lower_bound": lambda x, k, steps: bound(x), "tail_bound": lambda mode, x, k, steps: bound(x)}
+    task = replace(toy_task(5), **{which: bounds[which]})
+    with pytest.raises(ValueError, match=rf"{which}: expected a tensor of shape \(\d+,\) .*, got {got}"):
+        plan(task, [1.5, 1.0], solver="exhaustive")
+
+
+def test_snapshots_of_all_worlds_in_place_of_one_are_refused():
+    task, sim = toy_task(4), ToySim(3)
+    sim.reset(torch.tensor([X]).double().expand(3, -1), torch.zeros(3, 1).double())
+    with pytest.raises(ValueError, match=r"task 'toy': snapshot: expected 4 numbers, .* got shape \(3, 4\)"):
+        plan(task, X, snapshot=sim.save())
+    assert plan(task, X, snapshot=sim.save()[0].numpy()) == plan(task, X, snapshot=sim.save()[0])
+
+
+def test_a_disturbed_state_that_is_no_number_is_refused():
+    def disturb(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.stack([x, x * math.nan]), torch.stack([u, u])
+
+    lost = Ensemble(2, lambda which: ToySim(len(which)), disturb=disturb)
+    with pytest.raises(ValueError, match="disturb gave x or u with numbers that are not finite"):
+        plan(replace(toy_task(4), ensemble=lost), X)
 
 
 @pytest.mark.parametrize("cheap", [False, True])
