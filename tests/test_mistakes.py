@@ -6,14 +6,16 @@ import math
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from hmc import Cost, Ensemble, Mode, ModeSet, Rules, make_start, plan
+from hmc import Budget, Cost, Ensemble, Mode, ModeSet, Rules, make_start, plan
 from hmc.go2.task import JumpCfg
 from hmc.running import Running
 from hmc.sampling import METHODS, SamplingCfg
+from hmc.sim.check import check_latency
 from tests.linear import Linear
 from tests.test_sampling import mode, situations
 from tests.toy import COST, Push, Ramp, ToySim, toy_task
@@ -134,6 +136,26 @@ def test_a_mode_that_fails_as_it_is_entered_changes_nothing():
     assert running.ran == 5
 
 
+def test_nor_does_one_that_fails_after_it_has_changed_its_memory():
+    class Breaks(Mode):
+        name, memory_size = "breaks", 1
+
+        def act(self, x, u, memory, k):
+            memory += 1
+            if k[0] == 2:
+                raise KeyboardInterrupt
+            return u, memory
+
+    running = Running(ModeSet([Breaks()]))
+    x, u = torch.tensor(X, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    for step in range(2):
+        running.act(0, x, u, step)
+    with pytest.raises(KeyboardInterrupt):
+        running.act(0, x, u, 2)
+    assert running.memory is not None
+    assert running.memory.tolist() == [2.0]
+
+
 @pytest.mark.parametrize(
     ("gives", "words"),
     [
@@ -180,6 +202,14 @@ def test_a_disturbed_state_that_is_no_number_is_refused():
     lost = Ensemble(2, lambda which: ToySim(len(which)), disturb=disturb)
     with pytest.raises(ValueError, match="disturb gave x or u with numbers that are not finite"):
         plan(replace(toy_task(4), ensemble=lost), X)
+
+
+def test_a_number_of_draws_may_be_written_as_1e1():
+    assert plan(toy_task(4), X, samples=3, budget=Budget(draws=1e1)).draws == 10
+
+
+def test_a_latency_of_numpy_s_is_one_of_all_worlds():
+    assert check_latency(np.int64(2), 3, 4) == [2, 2, 2]
 
 
 @pytest.mark.parametrize("cheap", [False, True])
