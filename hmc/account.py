@@ -74,8 +74,7 @@ class Account:
 
     def settle(self, costs: Floats) -> None:
         """Add what `costs` came to."""
-        terms, done = costs.T, 0
-        terms *= self._dt
+        terms, done = costs.T * self._dt, 0  # not in place: a cost may keep what it gave
         steps, self._steps = self._steps, []
         for i, branches, x, _, _ in steps:
             stage = terms[:, done : done + len(x)]

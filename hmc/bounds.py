@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from hmc.branches import Branches
+from hmc.cost import checked
 from hmc.sim.device import upload
 from hmc.task import Task
 from hmc.worlds import Indices
@@ -34,7 +35,7 @@ class Rest:
         """
         steps, ks = len(self._modes) - i, torch.full((len(x),), k, device=x.device)
         any_way = self._task.lower_bound
-        least = None if any_way is None else any_way(x, ks, steps)
+        least = None if any_way is None else checked("lower_bound", any_way(x, ks, steps), (len(x),))
         if self._settled is None or self._task.tail_bound is None:
             return least
         alone, modes = self._settled[branches] <= i, self._modes[i, branches]
@@ -42,6 +43,7 @@ class Rest:
             # of all rather than of some of them: to pick those out takes longer
             found = self._task.tail_bound(self._task.modes[index], x, ks, steps)
             if found is not None:
+                checked("tail_bound", found, (len(x),))
                 here = upload((alone & (modes == index)).repeat(len(x) // len(modes)), x.device)
                 known = torch.zeros_like(found) if least is None else least
                 least = torch.where(here, torch.fmax(known, found), known)

@@ -63,7 +63,7 @@ class Meter:
         if self.expired():
             return 0, "seconds"
         if self.budget.draws is not None and self.budget.draws - self.draws < wanted:
-            return self.budget.draws - self.draws, "draws"
+            return int(self.budget.draws - self.draws), "draws"  # of 1e4, too
         return wanted, ""
 
     def affordable(self, schedules: Tensor | Neighbours) -> int:

@@ -47,7 +47,7 @@ class Cost:
         if not self.stage:
             return x.new_zeros(len(x), 0)
         if self.on_cpu is not None and x.device.type == "cpu" and x.dtype == torch.float64:
-            return _checked("cost on_cpu", self.on_cpu(x, u, u_prev, k), (len(x), len(self.stage)))
+            return checked("cost on_cpu", self.on_cpu(x, u, u_prev, k), (len(x), len(self.stage)))
         return torch.stack([_term(name, f(x, u, u_prev, k), x) for name, f in self.stage.items()]).T
 
     def terminal_terms(self, x: Tensor, k: Tensor) -> Tensor:
@@ -63,10 +63,10 @@ class Cost:
 
 
 def _term(name: str, found: Tensor, x: Tensor) -> Tensor:
-    return _checked(f"cost term {name!r}", found, (len(x),))
+    return checked(f"cost term {name!r}", found, (len(x),))
 
 
-def _checked(what: str, found: Tensor, shape: tuple[int, ...]) -> Tensor:
+def checked(what: str, found: Tensor, shape: tuple[int, ...]) -> Tensor:
     """What a user's function made of n states, if it is of the shape that is asked for."""
     if not isinstance(found, Tensor) or found.shape != shape:
         got = tuple(found.shape) if isinstance(found, Tensor) else repr(found)

@@ -79,7 +79,7 @@ class Ensemble:
         """Where each member begins; the engine's snapshot belongs to the nominal model alone.
 
         Raises:
-            ValueError: `disturb` gave states or inputs of another shape.
+            ValueError: `disturb` gave states or inputs of another shape, or not finite.
         """
         x, u = start.x.expand(self.size, -1), start.u.expand(self.size, -1)
         if self.disturb is not None:
@@ -89,6 +89,8 @@ class Ensemble:
                     f"an ensemble's disturb gave x {tuple(x.shape)} and u {tuple(u.shape)}, expected a row a "
                     f"member, {tuple(wanted[0])} and {tuple(wanted[1])}"
                 )
+            if not (x.isfinite().all() and u.isfinite().all()):
+                raise ValueError("an ensemble's disturb gave x or u with numbers that are not finite")
         return [replace(start, x=x[e], u=u[e], snapshot=None) for e in range(self.size)]
 
     def risk(self, costs: Tensor) -> Tensor:

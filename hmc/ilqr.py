@@ -70,7 +70,7 @@ def ilqr(
         tolerance: relative decrease of the cost below which it has converged.
 
     Raises:
-        ValueError: where the first inputs lead to a cost that is not finite.
+        ValueError: where the first inputs lead to a cost that is not finite, or derivatives are not.
     """
     problem = _Problem(step, cost, dt, k, lower.double(), upper.double())
     low, high = lower.double().numpy(), upper.double().numpy()
@@ -174,6 +174,10 @@ class _Problem:
         lx, lu = vmap(jacfwd(stage, (0, 1)))(*at)
         (lxx, _), (lux, luu) = vmap(hessian(stage, (0, 1)))(*at)
         parts = (a, b, lx, lu, lxx, lux, luu, jacfwd(final)(x[-1]), hessian(final)(x[-1]))
+        if not all(bool(part.isfinite().all()) for part in parts):  # which would pass for a minimum
+            raise ValueError(
+                "ilqr: dynamics or cost have derivatives that are not finite on the way: smooth them there"
+            )
         return _Models(*(part.detach().numpy() for part in parts))
 
 

@@ -64,7 +64,12 @@ class ConstantInput(Mode):
     """
 
     def __init__(self, name: str, value: float):
-        self.name, self.value = name, value
+        self.name, self._value = name, value
+
+    @property
+    def value(self) -> float:
+        """Of each number of the input; it stays, since a `ModeSet` looks it up once."""
+        return self._value
 
     def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         return torch.full_like(u, self.value), memory

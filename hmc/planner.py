@@ -42,7 +42,8 @@ class Plan:
         terms: its cost, term by term.
         incumbent: the schedule that the search began with.
         incumbent_terms: its cost, term by term.
-        switches: accepted switches, in order; stitched onto `incumbent` they give `schedule`.
+        switches: accepted switches, in order; stitched onto `incumbent` they give `schedule`, unless
+            that is the fallback.
         costs: the incumbent's cost, then the cost after each accepted switch, or pair of switches (never
             rising, Theorem 1).
         steps: why each of them: the switches accepted at once, and the cost's terms after them; one entry for
@@ -88,7 +89,7 @@ class Plan:
 
     @property
     def cost(self) -> float:
-        """J of `schedule`."""
+        """J of `schedule`; inf where that is the fallback."""
         return self.costs[-1]
 
     @property
@@ -98,7 +99,8 @@ class Plan:
 
     @property
     def schedules(self) -> tuple[Schedule, ...]:
-        """The incumbent and what each of `steps` made of it: one for each of `costs`, `schedule` the last."""
+        """The incumbent and what each of `steps` made of it: one for each of `costs`; `schedule` is the last,
+        unless that is the fallback."""
         made = [self.incumbent]
         for switches, _ in self.steps:
             made.append(reduce(Schedule.stitch, switches, made[-1]))

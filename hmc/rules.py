@@ -39,19 +39,27 @@ class Rules:
     guards: Mapping[str, Guard] = field(default_factory=dict)
     fallback: str | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "forbidden", tuple(self.forbidden))  # what zip() gives can be read once only
+
     def check(self, modes: ModeSet) -> None:
         """Refuse names that `modes` does not have, and numbers that mean nothing."""
+        for pair in self.forbidden:
+            if isinstance(pair, str) or len(pair) != 2:
+                raise ValueError(f"rules.forbidden has {pair!r}: expected pairs of modes, (from, to)")
         pairs = [name for pair in self.forbidden for name in pair]
         for name in (*self.dwell, *pairs, *self.guards, *filter(None, [self.fallback])):
             modes.index(name)
         for name, steps in self.dwell.items():
-            if steps < 1:
-                raise ValueError(f"rules.dwell of mode {name!r} must be at least 1 control step, got {steps}")
+            if not _whole(steps, 1):
+                raise ValueError(
+                    f"rules.dwell of mode {name!r} must be a whole number of control steps >= 1, got {steps}"
+                )
         for pair in self.forbidden:
             if pair[0] == pair[1]:
                 raise ValueError(f"rules.forbidden has {pair!r}, which is no change: leave it out")
-        if self.max_changes is not None and self.max_changes < 0:
-            raise ValueError(f"rules.max_changes must be >= 0, got {self.max_changes}")
+        if self.max_changes is not None and not _whole(self.max_changes, 0):
+            raise ValueError(f"rules.max_changes must be a whole number >= 0, got {self.max_changes}")
 
     def broken(self, modes: ModeSet, schedules: Tensor, mode: int | None, ran: int | None) -> Tensor:
         """Which of schedules (N, T) break a rule, whatever the states will be, (N,) bool.
@@ -130,3 +138,8 @@ class Rules:
                     )
                 bad[rows] = ~may
         return bad
+
+
+def _whole(number: float, least: int) -> bool:
+    """Whether it is a whole number, `least` or more."""
+    return number >= least and float(number).is_integer()

@@ -42,7 +42,7 @@ class Running:
         if self.memory is None or mode != self.mode:
             ran, memory = 1, chosen.reset(x[None], u[None], step)
         else:
-            ran, memory = (self.ran or 0) + 1, self.memory[None]
+            ran, memory = (self.ran or 0) + 1, self.memory[None].clone()  # which a mode may change in place
         action, memory = chosen.act(x[None], u[None], memory, step)
         # copies: the mode may use its tensors again, for a planner's rollouts in between
         action, memory = (part[0].to(x.dtype, copy=True) for part in (action, memory))

@@ -87,9 +87,9 @@ def mppi(cfg: SamplingCfg, noise: Tensor, costs: Tensor) -> tuple[Tensor, Tensor
         What the plan moves by, (n, K, d), and the noise's standard deviation in the re-plan's next
         update, (n, K, d), or None where it stays as it is.
     """
-    finite = costs.isfinite()
-    best = costs.min(1, keepdim=True).values
-    excess = torch.where(finite, costs - best, 0.0)
+    excess = costs - costs.min(1, keepdim=True).values
+    finite = (excess.square() * costs.shape[1]).isfinite()  # what cannot be squared would hide all others
+    excess = torch.where(finite, excess, 0.0)
     spread = (excess.square().sum(1, keepdim=True) / finite.sum(1, keepdim=True).clamp(min=1)).sqrt()
     weight = torch.exp(-excess / (cfg.temperature * spread).clamp(min=1e-9)) * finite
     weight = weight / weight.sum(1, keepdim=True).clamp(min=1e-9)

@@ -57,6 +57,8 @@ def make_start(
     """
     x = _vector(f"task {task.name!r}: state x", x, sim.nx, sim)
     u = _vector(f"task {task.name!r}: last input u", [0.0] * sim.nu if u is None else u, sim.nu, sim)
+    if snapshot is not None:
+        snapshot = _row(f"task {task.name!r}: snapshot", snapshot, sim.save(slice(0, 1)).shape[1], sim)
     if k < 0:
         raise ValueError(f"task {task.name!r}: control step k must be >= 0, got {k}")
     if mode is None:
@@ -75,10 +77,15 @@ def make_start(
     return Start(x, u, index, memory, k, snapshot, ran)
 
 
+def _row(what: str, values: Vector, size: int, sim: Sim) -> Tensor:
+    row = torch.as_tensor(values, dtype=sim.dtype, device=sim.device).detach().clone()
+    if row.shape != (size,):
+        raise ValueError(f"{what}: expected {size} numbers, shape ({size},), got shape {tuple(row.shape)}")
+    return row
+
+
 def _vector(what: str, values: Vector, size: int, sim: Sim) -> Tensor:
-    vector = torch.as_tensor(values, dtype=sim.dtype, device=sim.device).detach().clone()
-    if vector.shape != (size,):
-        raise ValueError(f"{what}: expected {size} numbers, shape ({size},), got shape {tuple(vector.shape)}")
+    vector = _row(what, values, size, sim)
     if not vector.isfinite().all():
         at = int((~vector.isfinite()).nonzero()[0])
         raise ValueError(

@@ -125,12 +125,16 @@ class Worlds:
         """Inputs of worlds that are all in one mode, (n, nu)."""
         mode, n, size = part.mode, len(x), part.mode.memory_size
         ks = torch.full((n,), k, device=x.device)
+        nested = mode.control_steps
         if part.entered is not None:
             self._enter(part, x, u, ks)
         memory = self.memory if size == self.memory.shape[1] else self.memory[:, :size]
         memory = memory[part.at] if isinstance(part.at, slice) else memory.index_select(0, part.at)
-        nested = mode.control_steps
-        action, after = mode.act(x, u, memory, ks)
+        found = mode.act(x, u, memory, ks)
+        if not isinstance(found, (tuple, list)) or len(found) != 2:  # two rows of a tensor would pass for it
+            got = type(found).__name__
+            raise ValueError(f"mode {mode.name!r}: act() gives (actions, memory), got a {got}")
+        action, after = found
         self.nested_steps += mode.control_steps - nested
         # what was picked out is a copy, which a mode may have changed in place
         if size > 0 and (after is not memory or isinstance(part.at, Tensor)):
@@ -186,6 +190,8 @@ class Crew:
 
 
 def _shaped(mode: Mode, what: str, value: Tensor, shape: tuple[int, int]) -> Tensor:
+    if not isinstance(value, Tensor):
+        raise ValueError(f"mode {mode.name!r}: {what} are {value!r}, expected a tensor of shape {shape}")
     if value.shape != shape:
         raise ValueError(f"mode {mode.name!r}: {what} have shape {tuple(value.shape)}, expected {shape}")
     return value

@@ -72,6 +72,20 @@ def test_control_steps_inside_modes_count():
     assert 6 * limited.rollouts < limited.control_steps
 
 
+def test_control_steps_on_entry_into_modes_count():
+    """Of a mode that plans as it is entered, and plays that."""
+
+    class PlansOnce(Damp):
+        memory_size = 1
+
+        def reset(self, x, u, k):
+            self.control_steps += 10 * len(x)
+            return super().reset(x, u, k)
+
+    task = toy_task(6, [Push(1.0), PlansOnce()])
+    assert plan(task, FAR, schedule=[0, 1, 1, 0, 1, 1], iterations=0).control_steps == 6 + 20
+
+
 def test_a_budget_that_reaches_all_of_omega_converges():
     task = toy_task(4)
     best = plan(task, FAR)

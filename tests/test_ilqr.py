@@ -129,3 +129,12 @@ def test_the_cartpole_swings_up_and_no_neighbour_is_better():
 def test_inputs_that_cost_infinity_are_refused():
     with pytest.raises(ValueError, match="the first inputs cost inf: begin from inputs with a finite cost"):
         ilqr(linear, QUADRATIC, DT, X * math.nan, torch.zeros(3, 2).double(), -BOUND, BOUND)
+
+
+def test_derivatives_that_are_no_numbers_are_no_minimum():
+    """A distance has none where it is 0, although its square does."""
+    cost = Cost(
+        {"far": lambda x, u, u_prev, k: x.square().sum(1).sqrt()}, {"end": lambda x, k: (x[:, 0] - 9) ** 2}
+    )
+    with pytest.raises(ValueError, match="derivatives that are not finite"):
+        ilqr(linear, cost, DT, X * 0, torch.zeros(3, 2).double(), -BOUND, BOUND)

@@ -6,17 +6,19 @@ import math
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from hmc import Cost, Mode, ModeSet, Rules, make_start, plan
+from hmc import Budget, Cost, Ensemble, Mode, ModeSet, Rules, make_start, plan
 from hmc.go2.task import JumpCfg
 from hmc.running import Running
 from hmc.sampling import METHODS, SamplingCfg
+from hmc.sim.check import check_latency
 from tests.linear import Linear
 from tests.test_sampling import mode, situations
-from tests.toy import Push, Ramp, toy_task
+from tests.toy import COST, Push, Ramp, ToySim, toy_task
 
 X = [0.3, 0.0]
 
@@ -132,3 +134,109 @@ def test_a_mode_that_fails_as_it_is_entered_changes_nothing():
         running.act(1, x, u, 5)
     assert (running.mode, running.ran, running.memory, running.u) == before
     assert running.ran == 5
+
+
+def test_nor_does_one_that_fails_after_it_has_changed_its_memory():
+    class Breaks(Mode):
+        name, memory_size = "breaks", 1
+
+        def act(self, x, u, memory, k):
+            memory += 1
+            if k[0] == 2:
+                raise KeyboardInterrupt
+            return u, memory
+
+    running = Running(ModeSet([Breaks()]))
+    x, u = torch.tensor(X, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    for step in range(2):
+        running.act(0, x, u, step)
+    with pytest.raises(KeyboardInterrupt):
+        running.act(0, x, u, 2)
+    assert running.memory is not None
+    assert running.memory.tolist() == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("gives", "words"),
+    [
+        (lambda u, memory: None, r"act\(\) gives \(actions, memory\), got a NoneType"),
+        (lambda u, memory: u[:1].repeat(2, 1), r"act\(\) gives \(actions, memory\), got a Tensor"),
+        (lambda u, memory: (0.5, memory), r"act\(\) actions are 0.5, expected a tensor of shape \(\d+, 1\)"),
+        (lambda u, memory: (u, None), r"act\(\) memory are None, expected a tensor of shape \(\d+, 1\)"),
+    ],
+)
+def test_a_mode_that_gives_something_else_is_named(gives, words):
+    class Slips(Mode):
+        name, memory_size = "slips", 1
+
+        def act(self, x, u, memory, k):
+            return gives(u, memory)
+
+    with pytest.raises(ValueError, match=f"mode 'slips': {words}"):
+        plan(toy_task(4, [Slips()]), X)
+
+
+@pytest.mark.parametrize("which", ["lower_bound", "tail_bound"])
+@pytest.mark.parametrize(
+    ("bound", "got"), [(lambda x: torch.full((len(x), 1), 0.1), r"\(\d+, 1\)"), (lambda x: 0.1, "0.1")]
+)
+def test_a_bound_of_another_shape_is_named(which, bound, got):
+    bounds = {"lower_bound": lambda x, k, steps: bound(x), "tail_bound": lambda mode, x, k, steps: bound(x)}
+    task = replace(toy_task(5), **{which: bounds[which]})
+    with pytest.raises(ValueError, match=rf"{which}: expected a tensor of shape \(\d+,\) .*, got {got}"):
+        plan(task, [1.5, 1.0], solver="exhaustive")
+
+
+def test_snapshots_of_all_worlds_in_place_of_one_are_refused():
+    task, sim = toy_task(4), ToySim(3)
+    sim.reset(torch.tensor([X]).double().expand(3, -1), torch.zeros(3, 1).double())
+    with pytest.raises(ValueError, match=r"task 'toy': snapshot: expected 4 numbers, .* got shape \(3, 4\)"):
+        plan(task, X, snapshot=sim.save())
+    assert plan(task, X, snapshot=sim.save()[0].numpy()) == plan(task, X, snapshot=sim.save()[0])
+
+
+def test_a_disturbed_state_that_is_no_number_is_refused():
+    def disturb(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.stack([x, x * math.nan]), torch.stack([u, u])
+
+    lost = Ensemble(2, lambda which: ToySim(len(which)), disturb=disturb)
+    with pytest.raises(ValueError, match="disturb gave x or u with numbers that are not finite"):
+        plan(replace(toy_task(4), ensemble=lost), X)
+
+
+def test_a_number_of_draws_may_be_written_as_1e1():
+    assert plan(toy_task(4), X, samples=3, budget=Budget(draws=1e1)).draws == 10
+
+
+def test_a_latency_of_numpy_s_is_one_of_all_worlds():
+    assert check_latency(np.int64(2), 3, 4) == [2, 2, 2]
+
+
+@pytest.mark.parametrize("cheap", [False, True])
+def test_a_cost_in_one_call_may_keep_what_it_gives(cheap):
+    """One that computes into a buffer of its own, and one that is always the same."""
+    buffer, ones = torch.empty(1000, 3, dtype=torch.float64), torch.ones(1000, 1, dtype=torch.float64)
+
+    def buffered(x: Tensor, *rest: Tensor) -> Tensor:
+        buffer[: len(x)] = torch.stack([term(x, *rest) for term in COST.stage.values()], 1)
+        return buffer[: len(x)]
+
+    time = Cost({"time": lambda x, u, u_prev, k: ones[: len(x), 0]}, nonnegative=True)
+    for cost, at_once in ((COST, buffered), (time, lambda x, *rest: ones[: len(x)])):
+        wanted = plan(toy_task(5, cost=cost, cheap=cheap), [1.5, 1.0], samples=4)
+        task = toy_task(5, cost=replace(cost, on_cpu=at_once), cheap=cheap)
+        found = plan(task, [1.5, 1.0], samples=4)
+        assert found == wanted
+        assert found.known.cost == wanted.known.cost
+    assert bool((ones == 1).all())
+
+
+@pytest.mark.parametrize(("dtype", "wall"), [(torch.float32, 1e20), (torch.float64, 1e200)])
+def test_a_sample_that_costs_too_much_to_be_squared_has_no_say(dtype, wall):
+    cfg = SamplingCfg(samples=3, temperature=0.5)
+    noise = torch.tensor([0.0, 1.0, 50.0], dtype=dtype)[None, :, None, None]
+    moved, inf = (
+        METHODS["mppi"](cfg, noise, torch.tensor([[1.0, 0.5, high]], dtype=dtype))[0]
+        for high in (wall, math.inf)
+    )
+    assert torch.equal(moved, inf)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmc.sim.base import Sim
+from hmc.sim.check import tell_overflow
 from hmc.sim.mixed import Mixed
 from hmc.sim.mujoco import MujocoSim
 from hmc.tasks.cartpole import CartpoleCfg, cartpole
@@ -76,3 +77,13 @@ def test_what_does_not_go_together_is_refused():
     mixed = Mixed(MAKE, [0, 1])
     with pytest.raises(ValueError, match=r"u must be \(2, 1\)"):
         mixed.step(torch.zeros(1, 1, dtype=torch.float64))
+
+
+def test_what_did_not_fit_in_one_of_them_is_told():
+    class Full(ToySim):
+        def overflow(self) -> dict[str, int]:
+            return {"contacts": 2, "constraints": 0}
+
+    mixed = Mixed([Full, ToySim, Full], [0, 1, 2, 0])
+    with pytest.warns(UserWarning, match="4 by contacts; give the simulator more contacts="):
+        tell_overflow(mixed)

@@ -253,10 +253,18 @@ def test_the_fallback_runs_where_nothing_else_may():
     ("rules", "words"),
     [
         (Rules(dwell={"dmap": 3}), "did you mean 'damp'"),
-        (Rules(dwell={"damp": 0}), "dwell of mode 'damp' must be at least 1 control step, got 0"),
+        (
+            Rules(dwell={"damp": 0}),
+            "dwell of mode 'damp' must be a whole number of control steps >= 1, got 0",
+        ),
+        (Rules(dwell={"damp": 2.5}), "control steps >= 1, got 2.5"),
+        (Rules(dwell={"damp": math.inf}), "control steps >= 1, got inf"),
         (Rules(forbidden=[("damp", "damp")]), "is no change"),
+        (Rules(forbidden=("damp", "ramp")), r"has 'damp': expected pairs of modes, \(from, to\)"),
+        (Rules(forbidden=[("damp", "ramp", "damp")]), "expected pairs of modes"),  # type: ignore[list-item]
         (Rules(forbidden=[("damp", "walk")]), "unknown mode 'walk'"),
-        (Rules(max_changes=-1), "max_changes must be >= 0, got -1"),
+        (Rules(max_changes=-1), "max_changes must be a whole number >= 0, got -1"),
+        (Rules(max_changes=math.nan), "max_changes must be a whole number >= 0, got nan"),
         (Rules(fallback="lie"), "unknown mode 'lie'"),
         (Rules(guards={"fly": lambda x, k: k > 0}), "unknown mode 'fly'"),
     ],
@@ -269,3 +277,9 @@ def test_rules_that_mean_nothing_are_refused(rules, words):
 def test_a_negative_time_is_refused():
     with pytest.raises(ValueError, match="ran >= 0 steps, got -2"):
         plan(toy_task(), FAR, mode=0, ran=-2)
+
+
+def test_changes_that_can_be_listed_only_once_are_forbidden_each_time():
+    rules = Rules(forbidden=zip(["push1"], ["damp"], strict=True))
+    for _ in range(2):
+        assert plan(ruled(rules), [0.3, 0.0], schedule=["push1"] + ["damp"] * 5).incumbent_cost == math.inf

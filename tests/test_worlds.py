@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import pytest
 import torch
 
-from hmc import ConstantInput, Evaluator, Mode, Schedule, make_start
+from hmc import ConstantInput, Evaluator, Mode, Motion, Schedule, make_start
 from tests.toy import Push, Ramp, all_schedules, toy_task
 
 
@@ -36,3 +39,21 @@ def test_a_mode_of_the_wrong_shape_is_named(part):
 
     with pytest.raises(ValueError, match=rf"mode 'wrong': act\(\) {part} have shape .*expected \(1, "):
         evaluator([Wrong()]).cost(Schedule((0,) * 6))
+
+
+def test_a_constant_input_stays_what_it_was_when_it_was_looked_up():
+    mode = ConstantInput("one", 1.0)
+    with pytest.raises(AttributeError, match="value"):
+        mode.value = 2.0  # type: ignore[misc]
+
+
+def test_motions_that_are_gone_are_not_kept():
+    """What is copied to a device once is kept for the next call, but not of every motion that ever was."""
+    gone = []
+    for i in range(100):
+        mode = Motion("motion", torch.full((3, 1), float(i)))
+        evaluator([mode]).cost(Schedule((0,) * 6))
+        gone.append(weakref.ref(mode.inputs))
+    del mode
+    gc.collect()
+    assert sum(each() is not None for each in gone) < 80

@@ -42,7 +42,7 @@ def check_latency(latency: int | Sequence[int], worlds: int, substeps: int) -> l
     Raises:
         ValueError: not one a world, or not within a control step of so many physics steps.
     """
-    late = [latency] * worlds if isinstance(latency, int) else list(latency)
+    late = [int(latency)] * worlds if isinstance(latency, int | np.integer) else list(latency)
     if len(late) != worlds or not 0 <= min(late) <= max(late) <= substeps:
         raise ValueError(
             f"latency must be 0 to {substeps} physics steps, a control step, one of all worlds or one of "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -69,7 +69,7 @@ def constant(values: Tensor, like: Tensor) -> Tensor:
     return _copied(values, like.dtype, like.device)
 
 
-@cache
+@lru_cache(maxsize=64)  # not of every mode that ever was
 def _copied(values: Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         return values.to(device, dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 import torch
@@ -91,6 +92,13 @@ class Mixed:
         check(self.num_worlds, ids, rows=(rows, max(self._widths)))
         for i, mine, at in self._parts(ids):
             self._sims[i].load(rows[mine, : self._widths[i]], at)
+
+    def overflow(self) -> dict[str, int]:
+        """World-steps that were spoiled since the last call, in simulators that tell it, by what for."""
+        lost: Counter[str] = Counter()
+        for sim in self._sims:
+            lost.update(getattr(sim, "overflow", dict)())
+        return dict(lost)
 
     def _gather(self, read: Callable[[Sim, Tensor], Tensor], width: int, ids: Ids) -> Tensor:
         """What is read of worlds `ids`, (n, width), zero where a simulator has fewer columns."""
