@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import mujoco
@@ -44,6 +44,7 @@ AT_MOST = {
 
 
 NOT_MEASURED = "not measured"
+FROM_ZERO = ("threads", "seed", "domain", "warm_up")  # the other whole numbers count what is measured
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,15 @@ class Common:
 
     json: Path | None = None
     threads: int = 0
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value, least = getattr(self, each.name), 0 if each.name in FROM_ZERO else 1
+            several = isinstance(value, tuple) and each.name != "set"
+            counts = value if several else [value] if type(value) is int else []
+            if (several and not counts) or any(count < least for count in counts):
+                got = "none" if value == () else value
+                raise ValueError(f"{each.name} must be at least {least}, got {got}")
 
 
 @dataclass
