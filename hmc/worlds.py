@@ -130,7 +130,10 @@ class Worlds:
         memory = self.memory if size == self.memory.shape[1] else self.memory[:, :size]
         memory = memory[part.at] if isinstance(part.at, slice) else memory.index_select(0, part.at)
         nested = mode.control_steps
-        action, after = mode.act(x, u, memory, ks)
+        acted = mode.act(x, u, memory, ks)
+        if isinstance(acted, Tensor):  # two worlds' actions alone would pass for actions and memory
+            raise ValueError(f"mode {mode.name!r}: act() must return (actions, memory), got one tensor")
+        action, after = acted
         self.nested_steps += mode.control_steps - nested
         # what was picked out is a copy, which a mode may have changed in place
         if size > 0 and (after is not memory or isinstance(part.at, Tensor)):
