@@ -215,10 +215,15 @@ def test_nothing_to_measure(kind: type[Common], given: dict[str, Any], line: str
         ),
         (Train(mode="sit"), "sit.toml: no such file"),
         (Planner(threads=1, horizon=3, cartpole_horizon=3, seeds=1, set=("tsak=1",)), "unknown key tsak"),
+        (
+            Growth(threads=1, horizons=(3,), samples=(19,)),
+            "samples must be at most 18, all switches of T 3, M 3",
+        ),
+        (Gpu(tiny=False, horizon=3), "batches must be at most 18, all switches of T 3, M 3, got 4096"),
         (Estimator(seconds=0.5), "seconds must be at least 1, since it begins with a stand, got 0.5"),
         (Deployed(seconds=0.01), "seconds must be at least 0.1, or there is no tick in them, got 0.01"),
     ],
-    ids=["folder", "policy", "mode", "set", "estimator", "deployed"],
+    ids=["folder", "policy", "mode", "set", "samples", "batches", "estimator", "deployed"],
 )
 def test_what_cannot_be_measured_is_a_line(args: Any, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:

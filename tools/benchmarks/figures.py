@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import onnxruntime
 import torch
 from rich.markup import escape
 from rich.table import Table
+
+from hmc.schedule import SwitchSpace
 
 # What the project asks of itself: figure -> at least, or at most, this much.
 AT_LEAST = {
@@ -100,6 +103,15 @@ class Figures:
             goal = f"<= {AT_MOST[name]:,g}" if name in AT_MOST else goal
             view.add_row(name, NOT_MEASURED, goal, escape(note))
         return view
+
+
+def fits(batches: Sequence[int], name: str, horizon: int) -> None:
+    """Raise a ValueError where a batch has more switches than there are, of three modes."""
+    size = len(SwitchSpace(3, horizon))
+    if max(batches) > size:
+        raise ValueError(
+            f"{name} must be at most {size}, all switches of T {horizon}, M 3, got {max(batches)}"
+        )
 
 
 def machine(threads: int) -> dict[str, str | int | float]:
