@@ -112,6 +112,8 @@ class ModeSet:
     def __init__(self, modes: Sequence[Mode]):
         if not modes:
             raise ValueError("a mode set needs at least one mode, got none: pass ModeSet([mode, ...])")
+        if classes := [mode.__name__ for mode in modes if isinstance(mode, type)]:
+            raise ValueError(f"mode {classes[0]} is a class: pass an object of it, {classes[0]}(...)")
         names = [mode.name for mode in modes]
         for name in names:
             if names.count(name) > 1:

@@ -264,6 +264,8 @@ def plan(
         ValueError: an argument that makes no sense, or not even one schedule fits into the memory.
         PlanInterrupted: on Ctrl-C; a KeyboardInterrupt that carries the best plan so far.
     """
+    if np.min(seed) < 0:
+        raise ValueError(f"seed must be >= 0, got {seed}")
     _known("solver", solver, SOLVERS)
     _known("order", order, ORDERS)
     samples = batch_of(task, solver, samples)

@@ -45,6 +45,11 @@ class Task:
     ensemble: Ensemble | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.modes, ModeSet):
+            raise ValueError(
+                f"task {self.name!r}: modes must be a ModeSet, got {type(self.modes).__name__}: pass "
+                "ModeSet([mode, ...])"
+            )
         if self.horizon <= 0:
             raise ValueError(
                 f"task {self.name!r}: horizon must be at least 1 control step, got {self.horizon}"

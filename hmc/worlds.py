@@ -133,7 +133,7 @@ class Worlds:
         found = mode.act(x, u, memory, ks)
         if not isinstance(found, (tuple, list)) or len(found) != 2:  # two rows of a tensor would pass for it
             got = type(found).__name__
-            raise ValueError(f"mode {mode.name!r}: act() gives (actions, memory), got a {got}")
+            raise ValueError(f"mode {mode.name!r}: act() must return (actions, memory), got a {got}")
         action, after = found
         self.nested_steps += mode.control_steps - nested
         # what was picked out is a copy, which a mode may have changed in place

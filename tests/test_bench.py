@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -186,6 +187,49 @@ def test_targets_are_printed_as_met_or_not() -> None:
     cells = [[str(cell) for cell in column.cells] for column in figures.table("bench").columns]
     assert ["not met" in text for text in cells[2]] == [False, True, False, True]
     assert "us" in cells[3][0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "line"),
+    [
+        (Engine, {"steps": 0}, "steps must be at least 1, got 0"),
+        (Engine, {"repeats": 0}, "repeats must be at least 1, got 0"),
+        (Engine, {"threads": -1}, "threads must be at least 0, got -1"),
+        (Train, {"iterations": 0}, "iterations must be at least 1, got 0"),
+        (Growth, {"horizons": ()}, "horizons must be at least 1, got none"),
+        (Growth, {"samples": (4, 0)}, r"samples must be at least 1, got \(4, 0\)"),
+    ],
+)
+def test_nothing_to_measure(kind: type[Common], given: dict[str, Any], line: str) -> None:
+    with pytest.raises(ValueError, match=line):
+        kind(**given)
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (Engine(json=Path()), "cannot write . (it is a folder): choose another file"),
+        (
+            Engine(threads=1, worlds=2, steps=1, repeats=1, policy=Path("none.onnx")),
+            "none.onnx: no such file",
+        ),
+        (Train(mode="sit"), "sit.toml: no such file"),
+        (Planner(threads=1, horizon=3, cartpole_horizon=3, seeds=1, set=("tsak=1",)), "unknown key tsak"),
+        (
+            Growth(threads=1, horizons=(3,), samples=(19,)),
+            "samples must be at most 18, all switches of T 3, M 3",
+        ),
+        (Gpu(tiny=False, horizon=3), "batches must be at most 18, all switches of T 3, M 3, got 4096"),
+        (Estimator(seconds=0.5), "seconds must be at least 1, since it begins with a stand, got 0.5"),
+        (Deployed(seconds=0.01), "seconds must be at least 0.1, or there is no tick in them, got 0.01"),
+    ],
+    ids=["folder", "policy", "mode", "set", "samples", "batches", "estimator", "deployed"],
+)
+def test_what_cannot_be_measured_is_a_line(args: Any, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(args)
+    assert ended.value.code == 2
+    assert line in capsys.readouterr().err
 
 
 def test_threads_default_to_all_cores() -> None:

@@ -6,9 +6,11 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 import hmc
+from tools import search_figure
 from tools.figures import search
 from tools.random_policy import write_random_policy
 from tools.search_figure import example
@@ -26,6 +28,16 @@ def test_the_example_swings_up(tmp_path, capsys):
     assert "of 22,650 switches" in capsys.readouterr().out
     search(tmp_path / "search.png", plan)
     assert (tmp_path / "search.png").stat().st_size > 5000
+
+
+def test_where_no_picture_can_be_drawn(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(search_figure, "example", dict)
+    with pytest.raises(SystemExit) as ended:
+        search_figure.main(search_figure.Args(tmp_path))
+    assert ended.value.code == 2
+    assert (
+        capsys.readouterr().err == f"error: cannot write {tmp_path} (it is a folder): choose another file\n"
+    )
 
 
 def test_a_policy_of_ones_own(tmp_path):

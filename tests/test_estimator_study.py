@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -45,6 +46,15 @@ def test_stopped_and_gone_on_with(tmp_path, monkeypatch, capsys):
     assert "nees_velocity" not in cheetah
 
 
+def test_a_motion_that_is_given_twice(tmp_path, monkeypatch):
+    """Is no second robot."""
+    monkeypatch.setattr(study, "run_all", lambda work, todo, *_: map(work, todo))
+    args = Args(seeds=1, seconds=1.1, motions=("stand", "stand"), filters=("ours",), out=tmp_path)
+    assert estimator_study.main(args) == 0
+    (row,) = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    assert row["seeds"] == 1
+
+
 def test_a_motion_that_is_not_there(tmp_path, capsys):
     with pytest.raises(SystemExit):
         estimator_study.main(Args(motions=("swim",), out=tmp_path))
@@ -55,7 +65,12 @@ def test_a_motion_that_is_not_there(tmp_path, capsys):
     ("given", "line"),
     [
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
-        ({"seconds": 0.5}, "seconds must be more than 1, of which no figure counts, got 0.5"),
+        ({"first_seed": -1}, "first_seed must be at least 0, got -1"),
+        (
+            {"seconds": 1.01},
+            "seconds must be at least 1.1, of which no figure counts in the first 1, got 1.01",
+        ),
+        ({"seconds": math.inf}, "seconds must be at least 1.1"),
         ({"filters": ()}, "--motions and --filters take one or more each"),
     ],
 )

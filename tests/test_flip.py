@@ -16,10 +16,11 @@ import torch
 from rich.console import Console
 
 from hmc.cfg import load
+from hmc.go2.model import DT
 from hmc.go2.stages import Stages
 from hmc.go2.stances import FOOTSTAND
 from hmc.go2.task import flip_task
-from tools import closed_loop, flip, record_flips
+from tools import closed_loop, figures, flip, jump_guess, record_flips, showreel
 from tools.random_policy import write_random_policy
 
 SHORT = (
@@ -165,6 +166,16 @@ def test_the_program(overrides, done, tmp_path, monkeypatch, capsys):
     assert flip.main(replace(args, seeds=1)) == 0
 
 
+def test_figures_are_in_seconds(cfg, done, tmp_path, monkeypatch):
+    """Of a run that is no whole number of control steps long, too: 0.21 s are ten of them."""
+    steps = []
+    monkeypatch.setattr(figures, "timeline", lambda *given: steps.append(given[5]))
+    monkeypatch.setattr(figures, "cost_terms", lambda *given: steps.append(given[4]))
+    longer = replace(cfg, seconds=0.21)
+    flip.write_run(tmp_path, done, flip_task(cfg.task), longer, False, Console(quiet=True))
+    assert steps == [DT, DT]
+
+
 def test_what_is_done_is_summarised_when_a_worker_is_lost(overrides, done, tmp_path, monkeypatch, capsys):
     def lost(*_):
         yield done
@@ -181,19 +192,51 @@ def test_what_is_done_is_summarised_when_a_worker_is_lost(overrides, done, tmp_p
     [
         ({"first": 32}, "expected 0 <= first <= last, got 32 and 30"),
         ({"states": 0}, "states must be at least 1, got 0"),
+        ({"out": Path()}, "error: cannot write . (it is a folder): choose another file"),
+        ({"seed": 10**30}, "error: Overflow"),
     ],
 )
 def test_records_of_no_jump(tmp_path, capsys, given, line):
     with pytest.raises(SystemExit) as ended:
-        record_flips.main(record_flips.Args(tmp_path / "flips.pt", **given))
+        record_flips.main(record_flips.Args(**{"out": tmp_path / "flips.pt", **given}))
     assert ended.value.code == 2
     assert line in capsys.readouterr().err
 
 
-def test_no_seeds(capsys):
-    with pytest.raises(SystemExit):
-        flip.main(flip.Args(seeds=0))
-    assert "seeds must be at least 1, got 0" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"points": 0}, "points must be at least 1, got 0"),
+        ({"elite": 1}, "elite must be 2 to 40, the number of candidates, got 1"),
+        ({"candidates": 6}, "elite must be 2 to 6, the number of candidates, got 8"),
+        ({"durations": ()}, "durations: expected one or more of at least 1 control step, got ()"),
+        ({"durations": (20, -1)}, "durations: expected one or more of at least 1 control step, got (20, -1)"),
+        ({"out": Path()}, "error: cannot write . (it is a folder): choose another file"),
+    ],
+)
+def test_a_search_of_nothing(tmp_path, capsys, given, line):
+    """Some wrote a guess of nan."""
+    with pytest.raises(SystemExit) as ended:
+        jump_guess.main(jump_guess.Args(**{"out": tmp_path / "guess.toml", **given}))
+    assert ended.value.code == 2
+    assert line in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("program", [flip, showreel])
+def test_no_seeds(program, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    for given, line in (
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"first_seed": -1}, "first_seed must be at least 0, got -1"),
+        ({"set": ("seconds=0",)}, "with seconds=0: "),
+        ({"out": tmp_path / "file"}, "cannot write"),
+    ):
+        with pytest.raises(SystemExit):
+            program.main(program.Args(**{"out": tmp_path / "out", **given}))
+        assert line in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
     with pytest.raises(ValueError, match="processes must be at least 1, or 0"):
         flip.Args(processes=-1)
 

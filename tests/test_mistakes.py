@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,6 +92,32 @@ def test_a_guard_that_does_not_say_yes_or_no_of_each_state_is_named(cheap, says,
         plan(task, X)
 
 
+def test_a_mode_that_forgets_the_memory_is_named():
+    """Of two worlds, the two actions alone passed for actions and memory."""
+
+    class Forgetful(Push):
+        def act(self, x: Tensor, u: Tensor, memory: Tensor, k: Tensor) -> Any:
+            return super().act(x, u, memory, k)[0]
+
+    with pytest.raises(
+        ValueError, match=r"mode 'push1': act\(\) must return \(actions, memory\), got a Tensor"
+    ):
+        plan(toy_task(4, [Push(0.0), Forgetful(1.0)]), X)
+
+
+def test_modes_that_are_none_yet():
+    modes: list[Any] = [Push(0.0), Ramp]
+    with pytest.raises(ValueError, match=r"modes must be a ModeSet, got list: pass ModeSet\(\[mode, ...\]\)"):
+        replace(toy_task(4), modes=[Push(0.0), Push(1.0)])
+    with pytest.raises(ValueError, match=r"mode Ramp is a class: pass an object of it, Ramp\(...\)"):
+        ModeSet(modes)
+
+
+def test_a_seed_below_zero():
+    with pytest.raises(ValueError, match="seed must be >= 0, got -1"):
+        plan(toy_task(4), X, seed=-1)
+
+
 def test_how_long_no_mode_has_been_running_is_refused():
     with pytest.raises(ValueError, match="ran=3 was given without the mode that ran"):
         plan(toy_task(4), X, ran=3)
@@ -159,8 +186,8 @@ def test_nor_does_one_that_fails_after_it_has_changed_its_memory():
 @pytest.mark.parametrize(
     ("gives", "words"),
     [
-        (lambda u, memory: None, r"act\(\) gives \(actions, memory\), got a NoneType"),
-        (lambda u, memory: u[:1].repeat(2, 1), r"act\(\) gives \(actions, memory\), got a Tensor"),
+        (lambda u, memory: None, r"act\(\) must return \(actions, memory\), got a NoneType"),
+        (lambda u, memory: u[:1].repeat(2, 1), r"act\(\) must return \(actions, memory\), got a Tensor"),
         (lambda u, memory: (0.5, memory), r"act\(\) actions are 0.5, expected a tensor of shape \(\d+, 1\)"),
         (lambda u, memory: (u, None), r"act\(\) memory are None, expected a tensor of shape \(\d+, 1\)"),
     ],

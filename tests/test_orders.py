@@ -41,6 +41,14 @@ def test_settings_of_both_systems():
     assert (cfg.seeds, cfg.cartpole.rollouts, cfg.flip.search.moves) == (2, 10, 3)
 
 
+@pytest.mark.parametrize("item", ["control_steps=0", "horizons=[40, 0]", "first_flip=-1"])
+def test_settings_that_no_run_can_have(item, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        orders.main(orders.Args(out=tmp_path, set=(item,)))
+    assert f"with {item}: OrdersCfg: {item.partition('=')[0]} must be at least" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_all_spend_the_same(cfg):
     for part, limit in (("solve", 60 * 8), ("loop", 2 * 10 * 8), ("flip", 40)):
         horizon = cfg.flip.task.horizon if part == "flip" else 8

@@ -82,6 +82,15 @@ def test_a_part_of_a_study_leaves_the_rest_in_the_table(tmp_path, monkeypatch):
     assert sorted(study.read(table, Row), key=lambda row: row.job.number) == [*whole, Row(Job(7), 49)]
 
 
+def test_what_is_asked_for_twice_counts_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "run_all", lambda do, todo, *_: map(do, todo))
+    jobs, workers, console = [Job(3), Job(2), Job(3)], study.Workers(), Console(quiet=True)
+    do, table = partial(work, tmp_path, -1), tmp_path / "table.csv"
+    for _ in range(2):
+        assert study.carry_out(do, jobs, table, Row, workers, console) == [Row(Job(3), 9), Row(Job(2), 4)]
+    assert (tmp_path / "begun").read_text().split() == ["3", "2"]
+
+
 def test_one_run_at_a_time_in_a_folder(tmp_path, capsys):
     folder = study.folder_of(tmp_path, Cfg(), Row)
     jobs, workers = [Job(1)], study.Workers(processes=1)
@@ -113,6 +122,19 @@ def test_a_file_is_whole_or_as_it_was(tmp_path):
         fails()
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_where_no_file_can_be_written(tmp_path):
+    """What is there stays as it is, and nothing is left beside it."""
+    path = tmp_path / "new" / "table.txt"
+    study.can_write(path)
+    path.write_text("before")
+    study.can_write(path)
+    assert path.read_text() == "before"
+    assert list(path.parent.iterdir()) == [path]
+    for there in (path.parent, path / "in_a_file.txt"):
+        with pytest.raises(ValueError, match=r"cannot write .*: choose another file"):
+            study.can_write(there)
 
 
 def test_a_lost_worker_is_a_line(tmp_path, capsys):
@@ -176,6 +198,15 @@ def test_what_ends_a_study_outside_its_jobs_is_a_line(capsys, end, status, line)
     (said,) = capsys.readouterr().err.splitlines()
     assert line in said
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_what_keeps_nothing_begins_anew(capsys):
+    @study.at_one_go
+    def main(_: None) -> int:
+        raise KeyboardInterrupt
+
+    assert main(None) == 1
+    assert capsys.readouterr().err == "stopped: the same command begins anew\n"
 
 
 def test_fewer_than_no_processes():

@@ -17,19 +17,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import torch
 from rich.console import Console
 
-from hmc.cli import command_line
+from hmc.cli import command_line, one_line_errors
 from tools.benchmarks.deployed import Deployed, deployed
 from tools.benchmarks.engine import Engine, engine
 from tools.benchmarks.estimator import Estimator, estimator
-from tools.benchmarks.figures import NOT_MEASURED, cores, machine
+from tools.benchmarks.figures import NOT_MEASURED, Figures, cores, machine
 from tools.benchmarks.gpu import Gpu, gpu
 from tools.benchmarks.growth import Growth, growth
 from tools.benchmarks.planner import Planner, planner
 from tools.benchmarks.train import Train, train
 from tools.benchmarks.wire import Wire, wire
-from tools.study import write_json
+from tools.study import at_one_go, can_write, write_json
 
 
+@at_one_go
 def main(args: Engine | Train | Planner | Wire | Estimator | Deployed | Growth | Gpu) -> int:
     """Measure, print, write."""
     threads = args.threads or cores()
@@ -39,23 +40,10 @@ def main(args: Engine | Train | Planner | Wire | Estimator | Deployed | Growth |
     torch.manual_seed(0)
     name = type(args).__name__.lower()
     host = machine(threads)
-    match args:
-        case Engine():
-            figures = engine(args)
-        case Train():
-            figures = train(args)
-        case Planner():
-            figures = planner(args)
-        case Wire():
-            figures = wire(args)
-        case Estimator():
-            figures = estimator(args)
-        case Deployed():
-            figures = deployed(args)
-        case Growth():
-            figures = growth(args)
-        case Gpu():
-            figures = gpu(args)
+    with one_line_errors():
+        if args.json is not None:
+            can_write(args.json)
+        figures = measure(args)
     console = Console()
     console.print(figures.table(f"bench {name}"))
     for key, note in figures.notes.items():
@@ -63,10 +51,30 @@ def main(args: Engine | Train | Planner | Wire | Estimator | Deployed | Growth |
             console.print(note)
     console.print(", ".join(f"{key} {value}" for key, value in host.items()), highlight=False)
     if args.json is not None:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
         missing = dict.fromkeys(figures.missing, NOT_MEASURED)
         write_json(args.json, {"bench": name, **figures.values, **missing, "machine": host})
     return 0
+
+
+def measure(args: Engine | Train | Planner | Wire | Estimator | Deployed | Growth | Gpu) -> Figures:
+    """The figures of one of them."""
+    match args:
+        case Engine():
+            return engine(args)
+        case Train():
+            return train(args)
+        case Planner():
+            return planner(args)
+        case Wire():
+            return wire(args)
+        case Estimator():
+            return estimator(args)
+        case Deployed():
+            return deployed(args)
+        case Growth():
+            return growth(args)
+        case Gpu():
+            return gpu(args)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from hmc import ModeSet, Receding, Task
 from hmc.cfg import load
 from hmc.cost import Cost
 from hmc.go2.conditions import Conditions, NoiseCfg, Robots
-from hmc.go2.model import SUBSTEPS, product
+from hmc.go2.model import DT, SUBSTEPS, product
 from hmc.go2.observe import pitch
 from hmc.go2.stages import Stages, judge
 from hmc.go2.stances import FOOTSTAND
@@ -60,6 +60,10 @@ class RunCfg:
     task: FlipCfg = field(default_factory=FlipCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
     start: StartCfg = field(default_factory=StartCfg)
+
+    def __post_init__(self) -> None:
+        if self.seconds <= DT / 2:  # they are rounded to control steps
+            raise ValueError(f"seconds must be at least one control step, {DT:g}, got {self.seconds:g}")
 
 
 MODEL = Conditions(noise=NoiseCfg.none())  # the robot is the planner's model, and knows its state

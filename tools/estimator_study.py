@@ -6,6 +6,7 @@ same frames. The policies that make the motions see the true state: the loop is 
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -30,7 +31,7 @@ from tools import study  # noqa: E402
 from tools.closed_loop import RunCfg, policies  # noqa: E402
 from tools.estimators.chi2 import band  # noqa: E402
 from tools.estimators.figure import draw  # noqa: E402
-from tools.estimators.measure import FILTERS, NEES, SETTLE, Job, Score, measure  # noqa: E402
+from tools.estimators.measure import COUNT, FILTERS, NEES, SETTLE, Job, Score, measure  # noqa: E402
 from tools.estimators.sensors import SensorCfg  # noqa: E402
 from tools.estimators.simulate import MOTIONS  # noqa: E402
 
@@ -71,11 +72,10 @@ class Args(study.Workers):
 
 def jobs(args: Args) -> list[Job]:
     """Every motion with every seed and filter."""
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
     return [
         Job(motion, args.seconds, seed, name)
         for motion in args.motions
-        for seed in seeds
+        for seed in study.seeds_of(args)
         for name in args.filters
     ]
 
@@ -148,12 +148,12 @@ def main(args: Args) -> int:
                 if item not in known:
                     raise ValueError(f"{item!r}: expected one of {', '.join(known)}")
         cfg = StudyCfg()
-        study.at_least_one(args, "seeds")
         if not jobs(args):
             raise ValueError("nothing to compare: --motions and --filters take one or more each")
-        if args.seconds <= SETTLE:
+        if not SETTLE + COUNT <= args.seconds < math.inf:
             raise ValueError(
-                f"seconds must be more than {SETTLE:g}, of which no figure counts, got {args.seconds:g}"
+                f"seconds must be at least {SETTLE + COUNT:g}, of which no figure counts in the first "
+                f"{SETTLE:g}, got {args.seconds:g}"
             )
         flip = ROOT / "cfg" / "flip.toml"
         files = flip, *policies(load(flip, RunCfg).task)
@@ -162,7 +162,8 @@ def main(args: Args) -> int:
     scores = study.carry_out(partial(work, cfg), jobs(args), scores_at, Score, args, console)
     if scores is None:
         return 1
-    rows = [summarise(scores, motion, name) for motion in args.motions for name in args.filters]
+    kinds = dict.fromkeys((score.job.motion, score.job.filter) for score in scores)
+    rows = [summarise(scores, *kind) for kind in kinds]
     study.write(args.out / "scores.csv", scores)
     settings = {"seeds": args.seeds, "first_seed": args.first_seed, "seconds": args.seconds}
     study.write_json(args.out / "summary.json", {"settings": settings, "rows": rows})

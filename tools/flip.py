@@ -28,7 +28,7 @@ from hmc.go2.task import flip_task  # noqa: E402
 from tools import figures, render  # noqa: E402
 from tools.closed_loop import Run, RunCfg, planned, run  # noqa: E402
 from tools.pool import ENDS, cores, kill_is_ctrl_c, pool_of, results, stop, stop_at_once, why  # noqa: E402
-from tools.study import at_least_one, write_json  # noqa: E402
+from tools.study import can_write, seeds_of, write_json  # noqa: E402
 
 
 def _work(cfg: RunCfg, seed: int, notes: Any) -> Run:
@@ -95,7 +95,7 @@ def write_run(out: Path, done: Run, task: Task, cfg: RunCfg, video: bool, consol
     stages = {name: bool(value) for name, value in vars(done.stages).items()}
     log = out / f"seed_{done.seed}.json"
     write_json(log, {"seed": done.seed, "stages": stages, "cost": done.cost, "steps": done.log})
-    dt, names = cfg.seconds / len(done.log), done.modes
+    names = done.modes
     title = f"seed {done.seed}: " + ", ".join(
         f"{name.replace('_', ' ')} {'yes' if ok else 'no'}" for name, ok in stages.items()
     )
@@ -105,12 +105,12 @@ def write_run(out: Path, done: Run, task: Task, cfg: RunCfg, video: bool, consol
         names,
         pitch(x).numpy(),
         x[:, 2].numpy(),
-        [cfg.task.command * dt],
-        dt,
+        [cfg.task.command * DT],
+        DT,
         title,
     )
-    terms = done.terms.numpy() / dt
-    figures.cost_terms(out / f"seed_{done.seed}_cost.png", list(task.cost.stage), terms, names, dt)
+    terms = done.terms.numpy() / DT
+    figures.cost_terms(out / f"seed_{done.seed}_cost.png", list(task.cost.stage), terms, names, DT)
     if video and (reason := render.render_run(render.Args(log))):
         console.print(reason)
 
@@ -162,12 +162,11 @@ class Args:
 def main(args: Args) -> int:
     """Run all seeds, write everything, return the exit status."""
     with one_line_errors():
-        at_least_one(args, "seeds")
+        seeds = seeds_of(args)
         cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
         flip_task(cfg.task)  # what is wrong with a policy file shows here
-        args.out.mkdir(parents=True, exist_ok=True)
+        can_write(args.out / "summary.json")
     console = Console()
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
     runs: list[Run] = []
     try:
         with kill_is_ctrl_c():

@@ -28,6 +28,7 @@ from hmc.sim.base import Sim  # noqa: E402
 from hmc.sim.mujoco import MujocoSim  # noqa: E402
 from hmc.task import Task  # noqa: E402
 from tools.closed_loop import RunCfg, disturbed_start  # noqa: E402
+from tools.study import at_least_one, at_one_go, can_write, whole  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Args:
     Attributes:
         iterations: of the cross-entropy method.
         candidates: an iteration.
-        elite: best candidates that the next iteration is drawn around.
+        elite: best candidates that the next iteration is drawn around, two or more.
         starts: foot stands that every candidate jumps from, new ones each iteration.
         durations: of the jump, control steps.
         points: of the guess.
@@ -45,7 +46,7 @@ class Args:
         settle: control steps under the hand mode, at whose end the robot is judged.
         seed: of everything random.
         threads: of the engine; 0 for all cores.
-        out: file to write the points to, as TOML.
+        out: file to write the points to, as TOML, after each iteration.
         warm: begin with the guess in cfg/flip.toml.
         conditions: a file with a table of this name, such as cfg/robustness.toml: every start is that of
             another robot of its `variants`; by default all are the nominal one.
@@ -148,11 +149,23 @@ def badness(x: Tensor, touched: Tensor) -> Tensor:
     return 2 * tilt + 4 * low + 0.1 * x[:, 19:25].norm(dim=1).clamp(max=5) + 1.0 * touched
 
 
+def check(args: Args) -> None:
+    """Raise a ValueError unless there is something to search for, and a file to write it to."""
+    at_least_one(args, "iterations", "candidates", "starts", "points", "settle")
+    if not args.durations or min(args.durations) < 1:
+        raise ValueError(f"durations: expected one or more of at least 1 control step, got {args.durations}")
+    if not 2 <= args.elite <= args.candidates:  # they have a standard deviation
+        raise ValueError(f"elite must be 2 to {args.candidates}, the number of candidates, got {args.elite}")
+    can_write(args.out)
+
+
+@at_one_go
 @torch.no_grad()
-def main(args: Args) -> None:
+def main(args: Args) -> int:
     """Search, show progress, write the best mean."""
-    torch.manual_seed(args.seed)
     with one_line_errors():
+        torch.manual_seed(args.seed)
+        check(args)
         cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
         task = flip_task(cfg.task, threads=args.threads)
         variants = VariantsCfg()
@@ -191,9 +204,10 @@ def main(args: Args) -> None:
             f"best {float(clean.max()):.0%}, spread {float(spread.mean()):.2f}"
         )
         rows = ",\n".join("  [" + ", ".join(f"{v:.3f}" for v in row) + "]" for row in mean.tolist())
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(f"guess = [\n{rows},\n]\n", encoding="utf-8")
+        with whole(args.out) as partial:
+            partial.write_text(f"guess = [\n{rows},\n]\n", encoding="utf-8")
+    return 0
 
 
 if __name__ == "__main__":
-    main(command_line(Args))
+    sys.exit(main(command_line(Args)))

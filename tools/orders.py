@@ -53,6 +53,13 @@ class OrdersCfg:
     flip: RunCfg = field(default_factory=RunCfg)
     cartpole: cartpole_study.StudyCfg = field(default_factory=cartpole_study.StudyCfg)
 
+    def __post_init__(self) -> None:
+        study.at_least_one(self, "control_steps")
+        if min(self.horizons, default=1) < 1:
+            raise ValueError(f"horizons must be at least 1 control step, got {self.horizons}")
+        if self.first_flip < 0:
+            raise ValueError(f"first_flip must be at least 0, got {self.first_flip}")
+
 
 @dataclass(frozen=True)
 class Job:

@@ -6,7 +6,6 @@ a random number of steps. Policies are trained (train/starts.py) and measured (t
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from hmc.cli import command_line, one_line_errors  # noqa: E402
 from hmc.go2.task import flip_task, make_sim  # noqa: E402
 from tools.closed_loop import RunCfg  # noqa: E402
 from tools.jump_guess import settled_stands  # noqa: E402
-from tools.study import at_least_one  # noqa: E402
+from tools.study import at_least_one, at_one_go, can_write, whole  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -50,14 +49,16 @@ class Args:
     set: tuple[str, ...] = ()
 
 
+@at_one_go
 @torch.no_grad()
-def main(args: Args) -> None:
+def main(args: Args) -> int:
     """Jump, keep, write."""
-    torch.manual_seed(args.seed)
     with one_line_errors():
+        torch.manual_seed(args.seed)
         at_least_one(args, "states")
         if not 0 <= args.first <= args.last:
             raise ValueError(f"first and last: expected 0 <= first <= last, got {args.first} and {args.last}")
+        can_write(args.out)
         cfg = load(ROOT / "cfg" / "flip.toml", RunCfg, args.set)
         task = flip_task(cfg.task, seed=args.seed, threads=args.threads)
         sim = make_sim(args.states, threads=args.threads)
@@ -75,13 +76,13 @@ def main(args: Args) -> None:
         action, memory = jump.act(sim.x(), sim.u(), memory, k + step)
         sim.step(action)
     finite = kept_x.isfinite().all(1)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    partial = args.out.with_suffix(".partial")
     kept = {"x": kept_x[finite].float(), "u": kept_u[finite].float(), "after": after[finite]}
-    torch.save({**kept, "command": shlex.join(["python", "tools/record_flips.py", *sys.argv[1:]])}, partial)
-    os.replace(partial, args.out)
+    command = shlex.join(["python", "tools/record_flips.py", *sys.argv[1:]])
+    with whole(args.out) as partial:
+        torch.save({**kept, "command": command}, partial)
     print(f"{args.out}: {int(finite.sum())} states")
+    return 0
 
 
 if __name__ == "__main__":
-    main(command_line(Args))
+    sys.exit(main(command_line(Args)))

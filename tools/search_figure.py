@@ -11,8 +11,9 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from hmc.cli import command_line  # noqa: E402
+from hmc.cli import command_line, one_line_errors  # noqa: E402
 from tools.figures import search  # noqa: E402
+from tools.study import can_write  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,13 @@ def example() -> dict[str, Any]:
     return names
 
 
-if __name__ == "__main__":
-    args = command_line(Args)
-    search(args.out, example()["plan"])
+def main(args: Args) -> None:
+    """Run the example, draw its search."""
+    with one_line_errors():
+        can_write(args.out)
+        search(args.out, example()["plan"])
     print(args.out)
+
+
+if __name__ == "__main__":
+    main(command_line(Args))

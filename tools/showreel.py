@@ -30,7 +30,7 @@ from hmc.receding import SearchCfg  # noqa: E402
 from tools import figures, render  # noqa: E402
 from tools.closed_loop import MODEL, RunCfg, study_cfg  # noqa: E402
 from tools.pool import ENDS, kill_is_ctrl_c, why  # noqa: E402
-from tools.study import Workers, at_least_one, run_all, write_json  # noqa: E402
+from tools.study import Workers, can_write, run_all, seeds_of, write_json  # noqa: E402
 
 ARRIVED = 0.3  # m: so near to its place a robot is there
 HOLD = 0.5  # s that a goal is held without a break, to be reached; the last one, at the end of its time
@@ -56,6 +56,10 @@ class ReelCfg:
     task: CourseCfg = field(default_factory=CourseCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
     flip: RunCfg = field(default_factory=RunCfg)
+
+    def __post_init__(self) -> None:
+        if self.seconds <= 0:
+            raise ValueError(f"seconds must be more than 0, got {self.seconds:g}")
 
     def make_task(self, seed: int = 0) -> Task:
         """The course, on one core."""
@@ -251,12 +255,11 @@ class Args(Workers):
 def main(args: Args) -> int:
     """Run all seeds, write everything, return the exit status."""
     with one_line_errors():
-        at_least_one(args, "seeds")
+        seeds = seeds_of(args)
         cfg = study_cfg(ROOT / "cfg" / "showreel.toml", ReelCfg, args.set)
         cfg.make_task()  # what is wrong with a policy file shows here
-        args.out.mkdir(parents=True, exist_ok=True)
+        can_write(args.out / "summary.json")
     console = Console()
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
     runs: list[Reel] = []
     try:
         with kill_is_ctrl_c():

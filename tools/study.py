@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -82,6 +83,27 @@ def at_least_one(of: Any, *names: str) -> None:
             raise ValueError(f"{name} must be at least 1, got {getattr(of, name)}")
 
 
+def seeds_of(args: Any) -> range:
+    """The `seeds` seeds from `first_seed` on that a command line asks for; a ValueError if these are none."""
+    at_least_one(args, "seeds")
+    if args.first_seed < 0:
+        raise ValueError(f"first_seed must be at least 0, got {args.first_seed}")
+    return range(args.first_seed, args.first_seed + args.seeds)
+
+
+def can_write(path: Path) -> None:
+    """Make the folder of a file; raise a ValueError unless the file can be written there, which what takes
+    minutes is not to find out at its end."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError("it is a folder")
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ValueError(f"cannot write {path} ({error}): choose another file") from error
+
+
 def folder_of(
     out: Path, cfg: Any, kind: Callable[..., Row], resume: bool = True, files: Iterable[Path] = ()
 ) -> Path:
@@ -133,7 +155,7 @@ def alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def stoppable(main: Callable[[A], int]) -> Callable[[A], int]:
+def stoppable(main: Callable[[A], int], then: str = "goes on from there") -> Callable[[A], int]:
     """A study's program that Ctrl-C, `kill` or a full disk end in a line that says how it goes on."""
 
     @functools.wraps(main)
@@ -142,15 +164,20 @@ def stoppable(main: Callable[[A], int]) -> Callable[[A], int]:
             with kill_is_ctrl_c():
                 return main(args)
         except ENDS as end:
-            print(f"{why(end)}: the same command goes on from there", file=sys.stderr)
+            print(f"{why(end)}: the same command {then}", file=sys.stderr)
             return 1
         except OSError as error:
             if os.environ.get("HMC_TRACEBACK"):
                 raise
-            print(f"error: {error}: mend that, and the same command goes on from there", file=sys.stderr)
+            print(f"error: {error}: mend that, and the same command {then}", file=sys.stderr)
             return 2
 
     return program
+
+
+def at_one_go(main: Callable[[A], int]) -> Callable[[A], int]:
+    """The same of a program that keeps nothing to go on from."""
+    return stoppable(main, "begins anew")
 
 
 def _itself(row: Any) -> Any:
@@ -178,7 +205,7 @@ def carry_out(
     Args:
         work: what makes a row of a job, in a process of its own that may be on another machine; a job whose
             process was lost is worked on again.
-        jobs: all of the study.
+        jobs: all of the study; those that come twice count once.
         table: .csv, whole at any time; rows in it are not made again.
         kind: of the rows.
         workers: who works.
@@ -187,6 +214,7 @@ def carry_out(
             here, because another machine has other folders.
         tell: told the rows so far, in the order of the jobs, whenever one is added.
     """
+    jobs = list(dict.fromkeys(jobs))  # what is asked for twice counts once
     with alone(table.parent):
         rows = {row.job: row for row in read(table, kind)} if table.exists() else {}
         todo, asked = [job for job in jobs if job not in rows], set(jobs)

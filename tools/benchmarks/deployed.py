@@ -44,6 +44,8 @@ class Deployed(Common):
 
 def deployed(args: Deployed) -> Figures:
     """Measure."""
+    if args.seconds < 0.1:
+        raise ValueError(f"seconds must be at least 0.1, or there is no tick in them, got {args.seconds:g}")
     figures = Figures()
     spent, ticked = frames(args.seconds, args.seed)
     figures.add("frame_share", spent.mean() / PERIOD, "of a core that the control process computes")

@@ -145,7 +145,7 @@ def engine(args: Engine) -> Figures:
 
     with tempfile.TemporaryDirectory() as folder:
         path = args.policy or policy_path("handstand")
-        if not path.is_file():
+        if args.policy is None and not path.is_file():
             path = write_random_policy(Path(folder) / "random.onnx")
         policy = Policy(path, name="hand", threads=threads)
         words = "random policy" if path.name == "random.onnx" else path.name

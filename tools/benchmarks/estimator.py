@@ -30,6 +30,8 @@ class Estimator(Common):
 
 def estimator(args: Estimator) -> Figures:
     """Measure."""
+    if args.seconds < 1.0:
+        raise ValueError(f"seconds must be at least 1, since it begins with a stand, got {args.seconds:g}")
     figures = Figures()
     for motion, suffix, name in (("flip", "", "flip, on two feet or none"), ("stand", "_four", "four feet")):
         readings = sense(simulate(motion, args.seconds, args.seed), args.seed)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import mujoco
@@ -13,6 +14,8 @@ import onnxruntime
 import torch
 from rich.markup import escape
 from rich.table import Table
+
+from hmc.schedule import SwitchSpace
 
 # What the project asks of itself: figure -> at least, or at most, this much.
 AT_LEAST = {
@@ -44,6 +47,7 @@ AT_MOST = {
 
 
 NOT_MEASURED = "not measured"
+FROM_ZERO = ("threads", "seed", "domain", "warm_up")  # the other whole numbers count what is measured
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,15 @@ class Common:
 
     json: Path | None = None
     threads: int = 0
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value, least = getattr(self, each.name), 0 if each.name in FROM_ZERO else 1
+            several = isinstance(value, tuple) and each.name != "set"
+            counts = value if several else [value] if type(value) is int else []
+            if (several and not counts) or any(count < least for count in counts):
+                got = "none" if value == () else value
+                raise ValueError(f"{each.name} must be at least {least}, got {got}")
 
 
 @dataclass
@@ -90,6 +103,15 @@ class Figures:
             goal = f"<= {AT_MOST[name]:,g}" if name in AT_MOST else goal
             view.add_row(name, NOT_MEASURED, goal, escape(note))
         return view
+
+
+def fits(batches: Sequence[int], name: str, horizon: int) -> None:
+    """Raise a ValueError where a batch has more switches than there are, of three modes."""
+    size = len(SwitchSpace(3, horizon))
+    if max(batches) > size:
+        raise ValueError(
+            f"{name} must be at most {size}, all switches of T {horizon}, M 3, got {max(batches)}"
+        )
 
 
 def machine(threads: int) -> dict[str, str | int | float]:

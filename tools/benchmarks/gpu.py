@@ -30,7 +30,7 @@ from hmc.sim.warp import WarpSim
 from tools import closed_loop, curves
 from tools.benchmarks import learning
 from tools.benchmarks.engine import add_ratio, same, take_turns
-from tools.benchmarks.figures import Common, Figures, cores
+from tools.benchmarks.figures import Common, Figures, cores, fits
 from tools.benchmarks.train import Train, iterations
 from train.config import ROOT, TrainCfg, read_training
 from train.env import Go2Env
@@ -102,6 +102,7 @@ def gpu(args: Gpu) -> Figures:
         figures.notes["gpu"] = (
             f"on {torch.cuda.get_device_name()}, CUDA driver {wp.get_cuda_driver_version()}"
         )
+    fits(args.batches, "batches", args.horizon)
     runs = [] if args.cpu is None else [curves.read(args.cpu)]
     for run in runs:
         learning.tell(figures, "train_cpu", run, args.level)

@@ -15,7 +15,7 @@ from hmc.go2.policy import Policy
 from hmc.go2.task import flip_task, policy_path
 from hmc.sim.mujoco import MujocoSim
 from tools import closed_loop
-from tools.benchmarks.figures import Common, Figures
+from tools.benchmarks.figures import Common, Figures, fits
 from train.config import ROOT
 
 
@@ -42,6 +42,7 @@ class Growth(Common):
 def growth(args: Growth) -> Figures:
     """Exact solutions, batches and bare steps, each at several sizes."""
     figures = Figures()
+    fits(args.samples, "samples", args.horizons[-1])
     run = load(ROOT / "cfg" / "flip.toml", closed_loop.RunCfg)
     flip = flip_task(run.task, threads=args.threads)
     x, u = closed_loop.disturbed_start(run.start, 0)

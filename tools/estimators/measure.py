@@ -22,6 +22,7 @@ from tools.estimators.simulate import Log, simulate
 FILTERS = ("ours", "cheetah", "invariant")
 NEES = {"velocity": 3, "gravity": 2, "biases": 6}  # degrees of freedom
 SETTLE = 1.0  # s at the start that no figure counts: filters begin at rest with what one reading tells
+COUNT = 0.1  # s after it, at least: a look at consistency is among them, even where a tick or two are lost
 _EVERY = 10  # ticks between the samples of NEES
 
 
