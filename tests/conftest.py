@@ -1,6 +1,7 @@
 """Set-up of the test run: one thread a library, no display, repeatable examples."""
 
 import os
+import signal
 
 # Before torch, numpy or MuJoCo load: their pools would fight over the cores with the sim's own threads.
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -19,6 +20,9 @@ TRIES = 4
 torch.set_num_threads(1)
 settings.register_profile("hmc", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("hmc")
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
